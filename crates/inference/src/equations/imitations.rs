@@ -75,7 +75,7 @@ impl Search<'_> {
     }
 
     /// Returns by how much the law of a cause is better with a size that changes with the state: nothing of the catalogue does that.
-    fn gain_of_changes(&self, best: &Fitted, small: &[Group], place: usize) -> f64 {
+    pub fn gain_of_changes(&self, best: &Fitted, small: &[Group], place: usize) -> f64 {
         let cause = &best.causes[place];
         let unknowns = self.laws[cause.law].units.len();
         let mut changes = vec![Column::default(); MODULATORS.len()];
@@ -91,6 +91,9 @@ impl Search<'_> {
             }
         }
         changes.retain(|change| !change.is_zero());
+        if changes.is_empty() {
+            return f64::NEG_INFINITY;
+        }
         let count = changes.len();
         let found = self.posterior_with(best, small, best, vec![Group::independent(changes, FORM_CHANGE[0])]);
         let first = found.mean.len() - count;

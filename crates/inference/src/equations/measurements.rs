@@ -75,8 +75,8 @@ pub struct Measurements {
     pub joints: Vec<JointRows>,
     /// The base, if orientation and angular velocity were measured.
     pub base: Option<BaseRows>,
-    /// True where a foot touches the ground, by foot and row; empty if it was not measured.
-    pub contact: Vec<Vec<bool>>,
+    /// True where a foot touches the ground, by foot and row; `None` in a row without a reading. Empty if it was not measured.
+    pub contact: Vec<Vec<Option<bool>>>,
     /// Supply voltage divided by the highest of the log; empty if it was not measured.
     pub voltage_share: Vec<f64>,
     /// Standard deviation of the noise of position [rad], velocity [rad/s] and torque [N·m].
@@ -132,12 +132,12 @@ impl Measurements {
         };
         let noise = [stated("q", 1e-4), stated("dq", 0.01), stated("tau_measured", 0.05)];
         let highest = log.channel("battery_V").map_or(0.0, |cells| cells.iter().copied().fold(0.0, f64::max));
-        let voltage = log.channel("battery_V").filter(|_| highest > 0.0);
-        let share = |cell: &f64| if cell.is_finite() { cell / highest } else { 1.0 };
+        let voltage = log.channel("battery_V").filter(|_| highest > 0.0).map(filled);
+        let share = |cell: f64| cell / highest;
         Some(Self {
             base: base_rows(log),
             contact: contact_rows(log, robot),
-            voltage_share: voltage.map_or(Vec::new(), |cells| cells.iter().map(share).collect()),
+            voltage_share: voltage.map_or(Vec::new(), |cells| cells.into_iter().map(share).collect()),
             t,
             dt,
             ranges,
@@ -159,8 +159,21 @@ fn joint_rows(log: &Log, name: &str, joint: usize) -> Option<JointRows> {
         torque: log.tau_measured(name)?.to_vec(),
         command: [log.q_cmd(name)?.to_vec(), or_zero(log.dq_cmd(name)), or_zero(log.tau_ff(name))],
         gains: [kp?, kd?],
-        temperature: log.channel(&format!("temp_{name}")).map_or(Vec::new(), <[f64]>::to_vec),
+        temperature: log.channel(&format!("temp_{name}")).map_or(Vec::new(), filled),
     })
+}
+
+/// Returns a series whose missing cells have the value before, or the first one; empty if it has no values. Slow sensors are read in few rows.
+fn filled(cells: &[f64]) -> Vec<f64> {
+    let Some(first) = cells.iter().copied().find(|cell| cell.is_finite()) else { return Vec::new() };
+    let mut last = first;
+    let mut next = |cell: &f64| {
+        if cell.is_finite() {
+            last = *cell;
+        }
+        last
+    };
+    cells.iter().map(&mut next).collect()
 }
 
 /// Returns the values of parabolas through [`SMOOTH_ROWS`] rows before and after each; near the ends of a range, the series itself.
@@ -199,11 +212,11 @@ fn base_rows(log: &Log) -> Option<BaseRows> {
     })
 }
 
-fn contact_rows(log: &Log, robot: &Robot) -> Vec<Vec<bool>> {
+fn contact_rows(log: &Log, robot: &Robot) -> Vec<Vec<Option<bool>>> {
     let of = |name: &str| log.channel(&format!("contact_{name}"));
     let channels: Option<Vec<&[f64]>> = robot.feet.iter().map(|foot| of(&foot.name)).collect();
-    channels
-        .map_or(Vec::new(), |all| all.into_iter().map(|cells| cells.iter().map(|cell| *cell > 0.5).collect()).collect())
+    let touches = |cell: &f64| cell.is_finite().then_some(*cell > 0.5);
+    channels.map_or(Vec::new(), |all| all.into_iter().map(|cells| cells.iter().map(touches).collect()).collect())
 }
 
 fn split_at_gaps(t: &[f64], range: Range<usize>) -> Vec<Range<usize>> {

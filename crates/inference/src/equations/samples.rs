@@ -217,6 +217,7 @@ fn base_motion(measured: &Measurements, rows: &Range<usize>, regime: Regime, of:
     };
     let of_velocity =
         (!base.velocity.is_empty()).then(|| into_base([0, 1, 2].map(|index| axis(&base.velocity, index)[1])));
+    let of_velocity = of_velocity.filter(|acceleration| acceleration.iter().all(|part| part.is_finite()));
     // The accelerometer is less noisy than a derivative, and has gravity in it. The columns have the acceleration of the other sensor,
     // whose noise is independent, or that of gravity alone.
     let [linear_acceleration, of_columns] = if base.acceleration.is_empty() {
@@ -250,8 +251,8 @@ impl Sample {
         let rows = self.rows.start.saturating_sub(settled)..(self.rows.end + settled).min(measured.t.len());
         let stands = |foot: usize| match measured.contact.get(foot) {
             Some(touches) => {
-                let first = touches[rows.start];
-                touches[rows.clone()].iter().all(|now| *now == first).then_some(first)
+                let first = touches[rows.start]?;
+                touches[rows.clone()].iter().all(|now| *now == Some(first)).then_some(first)
             }
             None => (self.regime == Regime::Stand).then_some(true),
         };

@@ -6,9 +6,12 @@ use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
 use twinstep_model::{BaseMount, JOINT_NAMES, go2};
 
 use super::block::{Block, Column};
+use super::causes::{Cause, ScopeSites};
 use super::law::{Law, Place, laws};
 use super::measurements::Measurements;
+use super::problem::Search;
 use super::robot::Robot;
+use super::search::LEAST_GAIN;
 use super::system::{Site, System, apply};
 
 const ROWS: usize = 1200;
@@ -16,6 +19,10 @@ const LEGS: [&str; 4] = ["FL", "FR", "RL", "RR"];
 
 /// Returns a log of 6 s: 2 s each of hanging, standing, and moving with two feet in the air.
 fn log() -> Log {
+    log_of(columns())
+}
+
+fn columns() -> BTreeMap<String, Vec<f64>> {
     let mut columns = BTreeMap::<String, Vec<f64>>::new();
     let mut push = |name: String, value: f64| columns.entry(name).or_default().push(value);
     for row in 0..ROWS {
@@ -46,6 +53,10 @@ fn log() -> Log {
             push(format!("vel_{axis}"), 0.0);
         }
     }
+    columns
+}
+
+fn log_of(columns: BTreeMap<String, Vec<f64>>) -> Log {
     let segment = |name: &str, base| Segment { name: name.to_owned(), base };
     let on_ground = ["sway", "trot"].map(|name| segment(name, BaseMount::Floating));
     let segments = [vec![segment("air", BaseMount::Fixed)], on_ground.to_vec()].concat();
@@ -55,8 +66,12 @@ fn log() -> Log {
 }
 
 fn system() -> (System, Robot) {
+    system_of(&log())
+}
+
+fn system_of(log: &Log) -> (System, Robot) {
     let robot = Robot::from(&go2());
-    let measured = Measurements::new(&log(), &robot, |_| true).expect("motor currents");
+    let measured = Measurements::new(log, &robot, |_| true).expect("motor currents");
     (System::new(measured, &robot), robot)
 }
 
@@ -140,4 +155,74 @@ fn torque_and_mass_together_change_no_residual_of_a_hanging_joint() {
     for (before, after) in before.iter().zip(after) {
         assert!((before - after).abs() < 1e-9, "{before} {after}");
     }
+}
+
+/// Returns by how much the delay of all commands is better with a size that changes, in a log whose commands have a delay that is given by
+/// time [s].
+fn gain_of_a_changing_delay(delay: impl Fn(f64) -> f64) -> f64 {
+    let mut columns = columns();
+    for (joint, name) in JOINT_NAMES.iter().enumerate() {
+        let rate = 6.0 + joint as f64;
+        let command = |row: usize, t: f64| {
+            let amplitude = if 3 * row / ROWS == 1 { 0.03 } else { 0.3 };
+            go2().control.default_pose[joint] + 1.1 * amplitude * (rate * (t + 0.01)).sin() + 0.1
+        };
+        let torque = |row: usize| {
+            let t = columns["t"][row];
+            let error = command(row, t - delay(t)) - columns[&format!("q_{name}")][row];
+            30.0 * error - 0.8 * columns[&format!("dq_{name}")][row]
+        };
+        let torques = (0..ROWS).map(torque).collect();
+        columns.insert(format!("tau_measured_{name}"), torques);
+    }
+    let (system, robot) = system_of(&log_of(columns));
+    let all = laws();
+    let law = all.iter().position(|law| law.effect.name == "command_delay").expect("a law");
+    let sites = (0..12).map(Site::Joint).collect();
+    let scope = ScopeSites { name: "all".to_owned(), sites, probability: 0.3, is_alike: true };
+    let cause = Cause { law, scope, shape: 0.0, values: vec![vec![0.25]; 12], log_prior: 0.0 };
+    let search = Search::new(&system, &all, Vec::new(), robot);
+    let fit = search.fit(vec![cause], &[], 8, None);
+    search.gain_of_changes(&fit, &[], 0)
+}
+
+#[test]
+fn delay_that_grows_with_time_is_another_law_and_a_constant_one_is_not() {
+    let [constant, growing] = [gain_of_a_changing_delay(|_| 0.005), gain_of_a_changing_delay(|t| 0.01 * t / 6.0)];
+    assert!(constant < 0.0, "{constant}");
+    assert!(growing > LEAST_GAIN, "{growing}");
+}
+
+/// Slow sensors are read in few rows, and any sensor loses some.
+#[test]
+fn readings_that_are_missing_leave_all_columns_finite() {
+    for name in
+        ["battery_V", "temp_FL_thigh", "vel_x", "acc_y", "gyro_z", "quat_w", "contact_FR", "tau_measured_RL_hip"]
+    {
+        let mut columns = columns();
+        let cells = columns.get_mut(name).expect("a channel");
+        cells.iter_mut().enumerate().filter(|(row, _)| row % 50 != 7).for_each(|(_, cell)| *cell = f64::NAN);
+        let (system, robot) = system_of(&log_of(columns));
+        let predicted = system.predicted(&robot);
+        for law in laws() {
+            let mut after = robot.clone();
+            apply(&mut after, &law, site_of(&law), &law.units, law.shapes[0]);
+            let column = system.column(&law, site_of(&law), (&robot, &predicted), &after);
+            let finite = column.parts.iter().flat_map(|(_, rows)| rows).all(|row| row.is_finite());
+            assert!(finite, "{name} missing, {}", law.effect.name);
+        }
+        let residuals = residuals(&system, &robot);
+        assert!(residuals.iter().flat_map(|block| &block.y).all(|residual| residual.is_finite()), "{name}");
+    }
+}
+
+#[test]
+fn temperature_of_a_slow_sensor_is_held_until_its_next_reading() {
+    let mut columns = columns();
+    let cells = columns.get_mut("temp_FL_thigh").expect("a channel");
+    cells.iter_mut().enumerate().filter(|(row, _)| row % 50 != 7).for_each(|(_, cell)| *cell = f64::NAN);
+    let expected = [cells[7], cells[7], cells[57]];
+    let (system, _) = system_of(&log_of(columns));
+    let held = &system.measured.joints[1].temperature;
+    assert_eq!([held[0], held[56], held[58]], expected);
 }
