@@ -4,7 +4,7 @@ use twinstep_effects::EffectEntry;
 use twinstep_effects::{ActuatorNetworkConfig, ModelFile, NetworkMode};
 use twinstep_logs::replay::at_log_rate;
 use twinstep_logs::{Log, TorqueSensor};
-use twinstep_model::{ActuatorMode, ActuatorTap, JOINT_NAMES, RobotModel};
+use twinstep_model::{ActuatorMode, ActuatorTap, JOINT_NAMES, NUM_JOINTS, RobotModel};
 use twinstep_simd::InstructionSet;
 
 use crate::EnsembleError;
@@ -42,7 +42,7 @@ impl ActuatorNetworkRobot {
         ensemble.check_rate("the robot's actuator", robot.control.actuator_dt())?;
         model.check_mode(settings.mode)?;
         if model.input == NetworkInput::Errors {
-            [robot.control.kp, robot.control.kd] = model.uniform_gains()?;
+            [robot.control.kp, robot.control.kd] = model.uniform_gains()?.map(|gain| [gain; NUM_JOINTS]);
         }
         let unknown = (0..JOINT_NAMES.len()).find(|joint| model.one_hot_index(*joint).is_none());
         if let Some(joint) = unknown.filter(|_| model.joint_input == JointEncoding::Identity) {

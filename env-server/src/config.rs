@@ -4,10 +4,11 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
+use twinstep_effects::ControlTable;
 use twinstep_envs::{Randomisation, TaskConfig};
 use twinstep_sim::SimConfig;
 
-/// The config file of a server: four tables, in which every key is optional.
+/// The config file of a server: tables, in which every key is optional.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
@@ -19,6 +20,9 @@ pub struct Config {
     pub sim: SimConfig,
     /// Domain randomisation.
     pub randomise: Randomisation,
+    /// Gains, rates, action scale and default pose: the contract of a policy. Its keys override those of the model file.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub control: Option<ControlTable>,
 }
 
 /// The `[server]` table.

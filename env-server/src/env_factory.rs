@@ -1,9 +1,9 @@
 //! Factories of the environments of a lease.
 
-use twinstep_effects::{ModelFile, ModelFileError, NetworkMode, RobotSampler, SamplingError};
+use twinstep_effects::{ModelFile, ModelFileError, NetworkMode, NominalRobotError, RobotSampler, SamplingError};
 use twinstep_ensemble::{ActuatorNetworkRobot, EnsembleError};
-use twinstep_envs::{Attitude, CounterEnv, GaitTask, Jump, TaskConfig, TaskEnv, TaskEnvConfig, Track, Walk};
-use twinstep_model::{Actuator, AutoresetMode, Backend, RobotModel, VecEnv};
+use twinstep_envs::{Attitude, CounterEnv, GaitTask, Jump, Task, TaskConfig, TaskEnv, TaskEnvConfig, Track, Walk};
+use twinstep_model::{Actuator, AutoresetMode, Backend, EnvSpec, RobotModel, VecEnv};
 use twinstep_policy::array_file::ArrayFileError;
 use twinstep_policy::{OtherBase, Policy, ResidualEnv};
 use twinstep_sim::{BackendBuildError, BatchBackend, Engine, MujocoBackend, MujocoPlant, RapierBackend};
@@ -74,6 +74,20 @@ pub enum EnvFactoryError {
         "the task `pose` is served by `twinstep serve --task pose`, in Rust by `TreeEnvFactory`; it has no other commands yet"
     )]
     TaskOfTrees,
+    /// The contract does not fit the robot.
+    #[error(transparent)]
+    Control(#[from] NominalRobotError),
+    /// A robot cannot do the task.
+    #[error("`task.name` = \"{task}\" is not possible on a robot: {reason}")]
+    NotOnRobots {
+        /// Name of the task.
+        task: &'static str,
+        /// What a robot lacks.
+        reason: &'static str,
+    },
+    /// A contract is given for a robot of another shape.
+    #[error("`control` and `--contract` are for quadrupeds; the model file of this robot states its own [control]")]
+    ContractOfQuadrupeds,
     /// Too few samples from the intervals of the model file are valid robots.
     #[error("`randomise.effects`: {0}")]
     Draws(#[from] SamplingError),
@@ -115,6 +129,10 @@ impl SimEnvFactory {
         let file = match &config.server.model {
             Some(path) => ModelFile::load(path)?,
             None => ModelFile::default(),
+        };
+        let file = match &config.control {
+            Some(control) => file.with_control(control)?,
+            None => file,
         };
         let learned = ActuatorNetworkRobot::load(&file)?;
         check_actuators(&config, learned.as_ref())?;
@@ -226,8 +244,33 @@ impl EnvFactory for SimEnvFactory {
     }
 }
 
+/// Returns the spec of a task on a robot. Without ground truth some reward terms and the critic group are missing.
+pub fn task_spec(config: &TaskConfig, robot: &RobotModel, has_ground_truth: bool) -> Result<EnvSpec, EnvFactoryError> {
+    Ok(match config.clone() {
+        TaskConfig::Walk(config) => Walk::new(config, robot, has_ground_truth)?.spec().clone(),
+        TaskConfig::Track(config) => Track::new(config, robot, has_ground_truth)?.spec().clone(),
+        TaskConfig::Jump(config) => Jump::new(config, robot, has_ground_truth)?.spec().clone(),
+        TaskConfig::Gait(config) => GaitTask::new(config, robot, has_ground_truth)?.spec().clone(),
+        TaskConfig::Attitude(config) => Attitude::new(config, robot, has_ground_truth)?.spec().clone(),
+        TaskConfig::Explore(config) => Walk::new(config.weighted_walk(), robot, has_ground_truth)?.spec().clone(),
+        TaskConfig::Pose(_) | TaskConfig::Counter => return Err(EnvFactoryError::TaskOfTrees),
+    })
+}
+
+/// Checks that a robot measures what a task observes.
+pub fn check_measurable(config: &TaskConfig) -> Result<(), EnvFactoryError> {
+    let reason = match config {
+        TaskConfig::Walk(_) | TaskConfig::Gait(_) | TaskConfig::Jump(_) | TaskConfig::Attitude(_) => return Ok(()),
+        TaskConfig::Track(_) => "it observes its position on the path, which no sensor of the robot measures",
+        TaskConfig::Explore(_) => "its reward needs actuator networks; run the policy that it trained as `walk`",
+        TaskConfig::Pose(_) => "it is for simulated robots of any shape",
+        TaskConfig::Counter => "it has no robot",
+    };
+    Err(EnvFactoryError::NotOnRobots { task: config.name(), reason })
+}
+
 /// Builds the environments of the configured task on a backend.
-fn task_env(
+pub fn task_env(
     config: &TaskConfig,
     backend: impl Backend + 'static,
     settings: TaskEnvConfig,

@@ -29,7 +29,7 @@ mod tree_env_factory;
 mod worker;
 
 pub use config::{Config, ConfigFileError, ServerConfig};
-pub use env_factory::{EnvFactory, EnvFactoryError, SimEnvFactory};
+pub use env_factory::{EnvFactory, EnvFactoryError, SimEnvFactory, check_measurable, task_env, task_spec};
 pub use frame_publisher::FramePublisher;
 pub use server::{Server, ServerError};
 pub use tree_env_factory::TreeEnvFactory;

@@ -28,6 +28,9 @@ pub struct TreeEnvFactory {
 impl TreeEnvFactory {
     /// Reads the model file and checks the settings. Default: the ideal Go2.
     pub fn new(config: &Config) -> Result<Self, EnvFactoryError> {
+        if config.control.is_some() {
+            return Err(EnvFactoryError::ContractOfQuadrupeds);
+        }
         let TaskConfig::Pose(task) = &config.task else {
             return Err(refused("task.name", "a robot of any tree has the task `pose`"));
         };
@@ -99,8 +102,8 @@ fn ideal_go2() -> TreeModelFile {
     let control = go2().control;
     let pose = JOINT_NAMES.iter().map(|name| (*name).to_owned()).zip(control.default_pose).collect();
     TreeModelFile {
-        kp: Some(NominalGain::All(control.kp)),
-        kd: Some(NominalGain::All(control.kd)),
+        kp: Some(NominalGain::All(control.kp[0])),
+        kd: Some(NominalGain::All(control.kd[0])),
         default_pose: pose,
         action_scale: Some(control.action_scale),
         ..TreeModelFile::go2()

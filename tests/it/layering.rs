@@ -23,7 +23,7 @@ const MAY_USE: [(&str, &[&str]); 30] = [
     ("crates/diagnose", &["model", "dynamics", "effects", "logs", "identify", "inference"]),
     ("crates/policy", &["files", "simd", "model"]),
     ("crates/learning", &["model", "policy"]),
-    ("crates/agent", &["model", "logs", "policy"]),
+    ("crates/agent", &["model", "effects", "logs", "policy"]),
     ("crates/session", &[]),
     ("crates/viewer", &["model"]),
     ("crates/robot", &["model", "logs", "unitree"]),

@@ -170,7 +170,7 @@ fn ensemble_trained_on_output_torque_replaces_the_rotor_inertia() {
 /// Steps two robots from their current state and returns positions, torques and uncertainty of each.
 fn steps<B: Simulator>(backend: &mut B, active: [bool; 2]) -> Vec<Vec<f32>> {
     let control = go2().control;
-    let hold = RobotCommand::hold(control.default_pose_f32(), control.kp as f32, control.kd as f32);
+    let hold = control.hold(control.default_pose_f32());
     let mut rows = Vec::new();
     for _ in 0..6 {
         backend.step(&[hold; 2], &active, 3).unwrap();

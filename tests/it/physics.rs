@@ -37,7 +37,7 @@ fn default_pose() -> PerJoint {
 
 fn hold_default_pose() -> Command {
     let control = go2().control;
-    Command::hold(default_pose(), control.kp as f32, control.kd as f32)
+    control.hold(default_pose())
 }
 
 fn run(backend: &mut TestedBackend, command: &Command, seconds: f32) {

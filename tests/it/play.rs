@@ -77,8 +77,9 @@ fn play_writes_the_log_of_the_simulated_robot() {
         }
         assert_eq!(log.channel("pos_z").unwrap()[row], f64::from(states.truth.base_position[0][2]));
         assert_eq!(log.channel("gyro_y").unwrap()[row], f64::from(states.measured.gyro[0][1]));
-        let mut command = RobotCommand::hold(target(row), KP as f32, robot.control.kd as f32);
-        (command.q[NUM_JOINTS - 1], command.kp[NUM_JOINTS - 1]) = (pose[NUM_JOINTS - 1], robot.control.kp as f32);
+        let mut command = RobotCommand::hold(target(row), KP as f32, robot.control.kd[0] as f32);
+        (command.q[NUM_JOINTS - 1], command.kp[NUM_JOINTS - 1]) =
+            (pose[NUM_JOINTS - 1], robot.control.kp[NUM_JOINTS - 1] as f32);
         let mut torque = 0.0;
         for _ in 0..4 {
             backend.step(&[command], &[true], 1).unwrap();
@@ -91,8 +92,8 @@ fn play_writes_the_log_of_the_simulated_robot() {
             assert!((logged - torque).abs() < 1e-9, "row {row}: {logged} N·m, not {torque}");
         }
     }
-    assert_eq!((log.kp("FL_hip", 0), log.kp("RR_calf", 0)), (Some(KP), Some(robot.control.kp)));
-    assert_eq!(log.kd("FL_hip", 0), Some(robot.control.kd));
+    assert_eq!((log.kp("FL_hip", 0), log.kp("RR_calf", 0)), (Some(KP), Some(robot.control.kp[NUM_JOINTS - 1])));
+    assert_eq!(log.kd("FL_hip", 0), Some(robot.control.kd[0]));
     let forces = log.channel("foot_force_FL").unwrap();
     assert!(forces[0].is_nan() && forces[1].is_finite());
 }

@@ -124,10 +124,10 @@ fn assert_near(one: &[f32], other: &[f32], tolerance: f32) {
 #[test]
 fn onnx_file_gives_the_actions_of_the_policy_file() {
     let network = OnnxNetwork::read(policies().join("walk.onnx")).unwrap();
-    assert_eq!((network.inputs(), network.outputs()), (45, 12));
+    assert_eq!((network.inputs()[0].len(), network.outputs()[0].len()), (45, 12));
     let policy = walk();
     for obs in observations(200) {
-        assert_near(&network.run(&obs).unwrap(), &original_action(&policy, &obs), 1e-5);
+        assert_near(&network.run(&[&obs]).unwrap()[0], &original_action(&policy, &obs), 1e-5);
     }
 }
 
@@ -179,7 +179,7 @@ fn exports_of_pytorch_give_the_actions_of_onnxruntime() {
     for case in serde_json::from_str::<Vec<serde_json::Value>>(&cases).unwrap() {
         let numbers = |key: &str| -> Vec<f32> { serde_json::from_value(case[key].clone()).unwrap() };
         let network = OnnxNetwork::read(case["path"].as_str().unwrap()).unwrap();
-        assert_near(&network.run(&numbers("obs")).unwrap(), &numbers("action"), 1e-5);
+        assert_near(&network.run(&[&numbers("obs")]).unwrap()[0], &numbers("action"), 1e-5);
     }
 }
 
@@ -277,7 +277,7 @@ fn policies_that_do_not_fit_are_refused_with_every_difference() {
     .assert_eq(&refusal(&in_place, &robot));
     let unmapped = LoadedPolicy::read(policies().join("walk.onnx"), None).unwrap();
     let mut stiff = go2();
-    stiff.control.kp = 40.0;
+    stiff.control.kp = [40.0; twinstep_model::NUM_JOINTS];
     let error = unmapped.bind(&base_spec("walk", &stiff, Vec::new(), 20.0)).unwrap_err().to_string();
     assert!(error.contains("kp: the policy has 30, the endpoint 40"), "{error}");
 }

@@ -69,7 +69,7 @@ fn torque_of_a_sample_is_that_of_the_pd_loop_from_its_reading() {
         for sample in env.samples(0).unwrap() {
             for joint in 0..NUM_JOINTS {
                 let error = f64::from(sample.q_cmd[joint]) - f64::from(sample.q[joint]);
-                let torque = control.kp * error - control.kd * f64::from(sample.dq[joint]);
+                let torque = control.kp[joint] * error - control.kd[joint] * f64::from(sample.dq[joint]);
                 // An ideal actuator within its limit.
                 assert!((torque - f64::from(sample.tau[joint])).abs() < 2e-3, "{torque} {}", sample.tau[joint]);
             }

@@ -78,7 +78,7 @@ fn entries(original: &Policy, mapping: &Mapping) -> Vec<Entry> {
     let mut entries = Vec::new();
     for (index, term) in mapping.observation.iter().enumerate() {
         let start = original.spec.observation_field(term.term.name()).expect("the policy observes it").0;
-        for entry in 0..term.term.len(joints) {
+        for entry in 0..term.len(joints) {
             let scale = term.scale.of(entry);
             let (ours, factor, offset) = match term.term {
                 TermName::JointPosition => {
@@ -101,7 +101,7 @@ fn entries(original: &Policy, mapping: &Mapping) -> Vec<Entry> {
 
 /// Returns the index of the present values of a term in the input of the network.
 fn present_start(mapping: &Mapping, term: usize) -> usize {
-    let len = |term: &Term| term.term.len(mapping.joints.len());
+    let len = |term: &Term| term.len(mapping.joints.len());
     let before = &mapping.observation[..term];
     let Some(history) = mapping.history else { return before.iter().map(len).sum() };
     let last = |term: &Term| match history.order {

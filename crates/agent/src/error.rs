@@ -18,7 +18,7 @@ pub enum AgentError {
         reason: String,
     },
     /// The extension of the policy is unknown.
-    #[error("`{}` is neither *.safetensors nor *.onnx", path.display())]
+    #[error("`{}` is neither *.safetensors nor *.onnx{}", path.display(), torch_hint(path))]
     UnknownFormat {
         /// The policy.
         path: PathBuf,
@@ -61,6 +61,22 @@ pub enum AgentError {
         /// What is wrong, where, and what is allowed.
         reason: String,
     },
+    /// A config of another program cannot be read.
+    #[error("{}: {reason}", path.display())]
+    Import {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        reason: String,
+    },
+    /// The contract of a policy cannot be read.
+    #[error("contract {}: {reason}", path.display())]
+    Contract {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        reason: String,
+    },
     /// Policy and endpoint do not agree. No action was sent.
     #[error("policy and endpoint do not agree; no action was sent\n{}\n  {hint}", lines(differences))]
     Disagreement {
@@ -92,6 +108,29 @@ pub enum AgentError {
         expected: usize,
         /// How the expected number is made up.
         hint: String,
+    },
+    /// The mapping names an input or output that the network does not have.
+    #[error("the network has no `{name}`; its {what} are {available}")]
+    UnknownPort {
+        /// The name in the mapping.
+        name: String,
+        /// `inputs` or `outputs`.
+        what: &'static str,
+        /// What the network has, with shapes.
+        available: String,
+    },
+    /// It is not known what an input of the network is.
+    #[error(
+        "the mapping does not say what the network's input {input} is\n  an observation or history: add the table          [input.{name}] to the mapping (docs/run.md); a state: add [[state]] with `input` and `output`\n  no output of its \
+         shape follows it; the outputs are {outputs}"
+    )]
+    UnassignedInput {
+        /// The input, with its shape.
+        input: String,
+        /// Its name.
+        name: String,
+        /// Outputs of the network, with shapes.
+        outputs: String,
     },
     /// The policy computed NaN or an infinite number. It was not sent.
     #[error("the policy's action for {joint} is {value} after {steps} steps; it was not sent")]
@@ -131,6 +170,19 @@ pub enum AgentError {
     /// The robot or the connection failed.
     #[error(transparent)]
     Env(#[from] EnvError),
+}
+
+/// Says how a file of PyTorch becomes one of ONNX.
+fn torch_hint(path: &std::path::Path) -> String {
+    if !path.extension().is_some_and(|end| end == "pt" || end == "pth" || end == "jit") {
+        return String::new();
+    }
+    format!(
+        "\n  a TorchScript file becomes ONNX in Python, with the length of its observation in place of 45:\n    import torch; \
+         torch.onnx.export(torch.jit.load(\"{}\").eval(), (torch.zeros(1, 45),), \"policy.onnx\", dynamo=False)\n  a checkpoint \
+         with weights alone (model_1000.pt) is exported by the program that trained it",
+        path.display()
+    )
 }
 
 fn lines(differences: &[SpecDifference]) -> String {

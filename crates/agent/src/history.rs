@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use crate::mapping::{HistoryLayout, HistoryOrder, Mapping};
+use crate::mapping::{History, HistoryLayout, HistoryOrder, Term, steps};
 
 /// Last values of each term.
 #[derive(Clone, Debug)]
@@ -17,11 +17,10 @@ pub struct ObservationHistory {
 
 impl ObservationHistory {
     /// Creates an empty history.
-    pub fn new(mapping: &Mapping) -> Self {
-        let steps: Vec<usize> = mapping.observation.iter().map(|term| mapping.steps(term)).collect();
+    pub fn new(terms: &[Term], history: Option<History>) -> Self {
+        let steps: Vec<usize> = terms.iter().map(|term| steps(term, history)).collect();
         // Without a table the order does not matter, because every term has one step.
-        let (layout, order) = mapping
-            .history
+        let (layout, order) = history
             .map_or((HistoryLayout::Terms, HistoryOrder::OldestFirst), |history| (history.layout, history.order));
         Self { terms: vec![VecDeque::new(); steps.len()], steps, layout, order }
     }

@@ -9,6 +9,8 @@ use crate::error::AgentError;
 
 /// Most steps of a history.
 const MAX_HISTORY: usize = 100;
+/// Largest output of a policy in use; those of walking quadrupeds are within ±4.
+const TYPICAL_ACTIONS: f32 = 4.0;
 
 /// Mapping between the observation and action of a policy and those of Twinstep (TOML).
 #[derive(Clone, Debug, PartialEq, Deserialize)]
@@ -18,19 +20,54 @@ pub struct Mapping {
     pub joints: Vec<String>,
     /// Joint offset of an action of 1 [rad]: one number, or one per joint in the order of `joints`.
     pub action_scale: Numbers,
-    /// Position gain that the policy was trained with [N·m/rad].
-    pub kp: f64,
-    /// Velocity gain that the policy was trained with [N·m·s/rad].
-    pub kd: f64,
+    /// Position gain that the policy was trained with [N·m/rad]: one number, or one per joint in the order of `joints`.
+    pub kp: Numbers,
+    /// Velocity gain that the policy was trained with [N·m·s/rad]: as `kp`.
+    pub kd: Numbers,
     /// Rate of the policy [Hz].
     pub policy_hz: f64,
     /// Joint positions to which actions and observed positions are relative, by joint [rad].
     pub default_pose: BTreeMap<String, f64>,
+    /// Lowest and highest output of the network; it is clipped before the scale, as legged_gym does. Default: none.
+    #[serde(default)]
+    pub action_clip: Option<[f32; 2]>,
+    /// Largest joint offset that an endpoint with this contract lets the policy command [rad]. Default: four times the
+    /// largest action scale.
+    #[serde(default)]
+    pub max_offset: Option<f32>,
     /// Terms of the observation, in order.
     pub observation: Vec<Term>,
     /// Earlier observations in the input of the network. Default: none.
     #[serde(default)]
     pub history: Option<History>,
+    /// Further inputs of the network, by name, such as a history apart from the present observation.
+    #[serde(default)]
+    pub input: BTreeMap<String, InputTable>,
+    /// Inputs that are the state of a recurrent network. Default: those that an output of the same shape follows.
+    #[serde(default)]
+    pub state: Vec<StatePair>,
+}
+
+/// A further input of the network.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct InputTable {
+    /// Terms of this input, in order. Default: those of the mapping.
+    #[serde(default)]
+    pub observation: Vec<Term>,
+    /// Earlier observations in this input. Default: none.
+    #[serde(default)]
+    pub history: Option<History>,
+}
+
+/// An input that is the state of a recurrent network, and the output that is the state after the step. It is 0 after a reset.
+#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct StatePair {
+    /// Name of the input.
+    pub input: String,
+    /// Name of the output.
+    pub output: String,
 }
 
 /// A term of the observation.
@@ -48,6 +85,30 @@ pub struct Term {
     /// Number of steps of this term, with the present one. Default: that of `[history]`.
     #[serde(default)]
     pub history: Option<usize>,
+    /// Period of `gait_phase` [s].
+    #[serde(default)]
+    pub period: Option<f64>,
+    /// `gait_phase` is 0 while the norm of the velocity command is smaller than this. Default: never.
+    #[serde(default)]
+    pub still_below: Option<f32>,
+    /// Entries of `constant`.
+    #[serde(default)]
+    pub values: Vec<f32>,
+}
+
+impl Term {
+    /// Returns the number of entries for a robot with `joints` joints.
+    pub fn len(&self, joints: usize) -> usize {
+        match self.term {
+            TermName::JointPosition
+            | TermName::AbsoluteJointPosition
+            | TermName::JointVelocity
+            | TermName::PreviousAction => joints,
+            TermName::GaitPhase => 2,
+            TermName::Constant => self.values.len(),
+            _ => 3,
+        }
+    }
 }
 
 /// Quantity that a policy observes, in the unit and frame of Twinstep.
@@ -64,10 +125,16 @@ pub enum TermName {
     VelocityCommand,
     /// Joint positions relative to the policy's default pose [rad].
     JointPosition,
+    /// Joint positions [rad].
+    AbsoluteJointPosition,
     /// Joint velocities [rad/s].
     JointVelocity,
     /// Output of the network in the previous step; 0 after a reset.
     PreviousAction,
+    /// Sine and cosine of a clock that is 0 at the reset, with the period `period`.
+    GaitPhase,
+    /// The numbers `values`.
+    Constant,
 }
 
 impl TermName {
@@ -79,16 +146,11 @@ impl TermName {
             Self::ProjectedGravity => "projected_gravity",
             Self::VelocityCommand => "velocity_command",
             Self::JointPosition => "joint_position",
+            Self::AbsoluteJointPosition => "absolute_joint_position",
             Self::JointVelocity => "joint_velocity",
             Self::PreviousAction => "previous_action",
-        }
-    }
-
-    /// Returns the number of entries for a robot with `joints` joints.
-    pub fn len(self, joints: usize) -> usize {
-        match self {
-            Self::JointPosition | Self::JointVelocity | Self::PreviousAction => joints,
-            _ => 3,
+            Self::GaitPhase => "gait_phase",
+            Self::Constant => "constant",
         }
     }
 }
@@ -179,28 +241,64 @@ impl Mapping {
         Ok(mapping)
     }
 
-    /// Returns the number of steps of a term in the input of the network.
-    pub fn steps(&self, term: &Term) -> usize {
-        term.history.or(self.history.map(|history| history.length)).unwrap_or(1)
+    /// Returns the terms and the history of an input of the network; `None` is the one that `[[observation]]` describes.
+    pub fn terms(&self, input: Option<&str>) -> (&[Term], Option<History>) {
+        match input.and_then(|name| self.input.get(name)) {
+            Some(table) if table.observation.is_empty() => (&self.observation, table.history),
+            Some(table) => (&table.observation, table.history),
+            None => (&self.observation, self.history),
+        }
     }
 
-    /// Returns the length of the input of the network.
+    /// Returns the number of steps of a term of `[[observation]]`.
+    pub fn steps(&self, term: &Term) -> usize {
+        steps(term, self.history)
+    }
+
+    /// Returns the length of the input that `[[observation]]` describes.
     pub fn input_len(&self) -> usize {
-        self.observation.iter().map(|term| self.steps(term) * term.term.len(self.joints.len())).sum()
+        self.len_of(None)
+    }
+
+    /// Returns the length of an input of the network.
+    pub fn len_of(&self, input: Option<&str>) -> usize {
+        let (terms, history) = self.terms(input);
+        terms.iter().map(|term| steps(term, history) * term.len(self.joints.len())).sum()
+    }
+
+    /// Returns the largest joint offset that an endpoint should let the policy command [rad].
+    pub fn max_offset(&self) -> f32 {
+        let largest = (0..self.joints.len()).map(|index| self.action_scale.of(index).abs()).fold(0.0, f32::max);
+        self.max_offset.unwrap_or(TYPICAL_ACTIONS * largest)
     }
 
     fn check(&self) -> Result<(), String> {
         self.check_joints()?;
-        for (key, value) in [("kp", self.kp), ("kd", self.kd), ("policy_hz", self.policy_hz)] {
-            if !(value.is_finite() && value > 0.0) {
+        for (key, numbers) in [("kp", &self.kp), ("kd", &self.kd)] {
+            numbers.check(key, self.joints.len())?;
+            if let Some(value) = (0..self.joints.len()).map(|index| numbers.of(index)).find(|value| *value < 0.0) {
+                return Err(format!("`{key}` has {value}; numbers greater than 0 are expected"));
+            }
+        }
+        for (key, value) in [("policy_hz", Some(self.policy_hz)), ("max_offset", self.max_offset.map(f64::from))] {
+            if let Some(value) = value.filter(|value| !(value.is_finite() && *value > 0.0)) {
                 return Err(format!("`{key}` = {value}; a finite number greater than 0 is expected"));
             }
         }
         self.action_scale.check("action_scale", self.joints.len())?;
+        check_range("action_clip", self.action_clip)?;
         if self.observation.is_empty() {
             return Err("`observation` has no terms; at least one [[observation]] is expected".to_owned());
         }
-        self.observation.iter().try_for_each(|term| self.check_term(term, self.joints.len()))
+        let inputs = std::iter::once(None).chain(self.input.keys().map(|name| Some(name.as_str())));
+        for input in inputs {
+            let (terms, history) = self.terms(input);
+            let place = input.map_or_else(String::new, |name| format!("input.{name}: "));
+            for term in terms {
+                check_term(term, history, self.joints.len()).map_err(|problem| format!("{place}{problem}"))?;
+            }
+        }
+        Ok(())
     }
 
     fn check_joints(&self) -> Result<(), String> {
@@ -219,25 +317,51 @@ impl Mapping {
             None => Ok(()),
         }
     }
+}
 
-    fn check_term(&self, term: &Term, joints: usize) -> Result<(), String> {
-        let name = term.term.name();
-        term.scale.check(&format!("scale of {name}"), term.term.len(joints))?;
-        if let Some([low, high]) = term.clip
-            && (!low.is_finite() || !high.is_finite() || low >= high)
-        {
-            return Err(format!("`clip` of {name} is [{low}, {high}]; the first must be less than the second"));
+/// Returns the number of steps of a term in an input with this history.
+pub fn steps(term: &Term, history: Option<History>) -> usize {
+    term.history.or(history.map(|history| history.length)).unwrap_or(1)
+}
+
+fn check_range(key: &str, range: Option<[f32; 2]>) -> Result<(), String> {
+    match range {
+        Some([low, high]) if !low.is_finite() || !high.is_finite() || low >= high => {
+            Err(format!("`{key}` is [{low}, {high}]; the first must be less than the second"))
         }
-        if !(1..=MAX_HISTORY).contains(&self.steps(term)) {
-            return Err(format!("`history` of {name} is {}; 1 to {MAX_HISTORY} is allowed", self.steps(term)));
+        _ => Ok(()),
+    }
+}
+
+fn check_term(term: &Term, history: Option<History>, joints: usize) -> Result<(), String> {
+    let name = term.term.name();
+    match (term.term, term.period) {
+        (TermName::GaitPhase, None) => return Err(format!("{name} has no `period`, the time of a cycle [s]")),
+        (TermName::GaitPhase, Some(period)) if !(period.is_finite() && period > 0.0) => {
+            return Err(format!("`period` of {name} is {period}; a finite number greater than 0 is expected"));
         }
-        match (term.history, self.history.map(|history| history.layout)) {
-            (Some(_), None) => Err(format!("{name} has `history`, but there is no table [history] with its order")),
-            (Some(_), Some(HistoryLayout::Frames)) => {
-                Err(format!("{name} has its own `history`, which `layout = \"frames\"` does not allow"))
-            }
-            _ => Ok(()),
+        (TermName::Constant, _) if term.values.is_empty() || term.values.iter().any(|value| !value.is_finite()) => {
+            return Err(format!("`values` of {name} must be finite numbers, one for each entry"));
         }
+        (TermName::GaitPhase | TermName::Constant, _) => {}
+        (_, Some(_)) => return Err(format!("{name} has a `period`, which is for gait_phase")),
+        _ => {}
+    }
+    if term.term != TermName::Constant && !term.values.is_empty() {
+        return Err(format!("{name} has `values`, which are for constant"));
+    }
+    term.scale.check(&format!("scale of {name}"), term.len(joints))?;
+    check_range(&format!("clip of {name}"), term.clip)?;
+    let steps = steps(term, history);
+    if !(1..=MAX_HISTORY).contains(&steps) {
+        return Err(format!("`history` of {name} is {steps}; 1 to {MAX_HISTORY} is allowed"));
+    }
+    match (term.history, history.map(|history| history.layout)) {
+        (Some(_), None) => Err(format!("{name} has `history`, but there is no table [history] with its order")),
+        (Some(_), Some(HistoryLayout::Frames)) => {
+            Err(format!("{name} has its own `history`, which `layout = \"frames\"` does not allow"))
+        }
+        _ => Ok(()),
     }
 }
 
@@ -266,7 +390,7 @@ mod tests {
 
     #[test]
     fn errors_name_the_key_its_value_and_what_is_allowed() {
-        expect!["`kp` = -25; a finite number greater than 0 is expected"].assert_eq(&error("", "kp = 25", "kp = -25"));
+        expect!["`kp` has -25; numbers greater than 0 are expected"].assert_eq(&error("", "kp = 25", "kp = -25"));
         expect!["`joints` has a twice"].assert_eq(&error("", "\"b\"", "\"a\""));
         expect!["`default_pose` has no b, which is in `joints`"].assert_eq(&error("", ", b = 0.2", ""));
         expect!["`default_pose` has c, which is not in `joints`"].assert_eq(&error("", "0.1,", "0.1, c = 0,"));
@@ -283,7 +407,7 @@ mod tests {
             "",
         ));
         let clip = "position\"\nclip = [1, -1]";
-        expect!["`clip` of joint_position is [1, -1]; the first must be less than the second"].assert_eq(&error(
+        expect!["`clip of joint_position` is [1, -1]; the first must be less than the second"].assert_eq(&error(
             "",
             "position\"",
             clip,

@@ -8,7 +8,7 @@ use twinstep_policy::{Policy, PolicyRunner};
 use crate::error::AgentError;
 use crate::mapped_policy::MappedPolicy;
 use crate::mapping::Mapping;
-use crate::onnx::OnnxNetwork;
+use crate::onnx::{OnnxNetwork, Port};
 use crate::policy_input::PolicyInput;
 
 /// A policy that was read from a file.
@@ -76,9 +76,11 @@ impl LoadedPolicy {
             }
             Source::Onnx(network, own) => {
                 check_spec(&own, spec)?;
-                for (what, given, expected) in
-                    [("inputs", network.inputs(), own.obs_len()), ("outputs", network.outputs(), own.action_len())]
-                {
+                let (inputs, outputs) = (network.inputs(), network.outputs());
+                for (what, given, expected) in [
+                    ("inputs", inputs.iter().map(Port::len).sum(), own.obs_len()),
+                    ("outputs", outputs[0].len(), own.action_len()),
+                ] {
                     if given != expected {
                         let hint = "the `spec` in its metadata does not belong to it".to_owned();
                         return Err(AgentError::NetworkSize { what, given, expected, hint });
@@ -109,7 +111,7 @@ impl BoundPolicy {
                 runner.run(input.obs, &mut action);
                 Ok(action)
             }
-            Evaluator::Onnx(network) => Ok(network.run(input.obs)?),
+            Evaluator::Onnx(network) => Ok(network.run(&[input.obs])?.swap_remove(0)),
             Evaluator::Mapped(policy) => policy.action(input),
         }
     }

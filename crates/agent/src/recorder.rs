@@ -127,8 +127,8 @@ fn meta(spec: &EnvSpec, layout: &Layout, source: &str) -> Meta {
             "position targets held for {} s, PD loop every {} s, targets clipped to default pose ± {} rad",
             spec.policy_dt, spec.actuator_dt, spec.action_scale
         )),
-        kp: Some(Gain::Uniform(spec.kp)),
-        kd: Some(Gain::Uniform(spec.kd)),
+        kp: Some(Gain::by_joint((0..spec.joint_order.len()).map(|joint| spec.gains(joint)[0]))),
+        kd: Some(Gain::by_joint((0..spec.joint_order.len()).map(|joint| spec.gains(joint)[1]))),
         source: Some(format!("{source}; observations of an agent at the rate of its policy{truth}")),
         ..Meta::new(policy_hz, TorqueSensor::None, segments)
     }

@@ -159,8 +159,8 @@ fn whole_identification(experiment: &Experiment, interrupted: Interrupted) -> Re
 fn setup(log: &Log, window_s: f64) -> Setup {
     let (control, hz) = (go2().control, SimConfig::default().physics_hz());
     let actuator = MjcfActuator::Position {
-        kp: log.kp(JOINT_NAMES[0], 0).unwrap_or(control.kp),
-        kd: log.kd(JOINT_NAMES[0], 0).unwrap_or(control.kd),
+        kp: log.kp(JOINT_NAMES[0], 0).unwrap_or(control.kp[0]),
+        kd: log.kd(JOINT_NAMES[0], 0).unwrap_or(control.kd[0]),
     };
     let model = mjcf(
         &go2(),

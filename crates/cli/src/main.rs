@@ -22,6 +22,7 @@ mod frame_feed;
 mod hunt;
 mod identify;
 mod identify_tree;
+mod import_policy;
 mod key_terminal;
 mod learned_residual;
 mod line_printer;
@@ -92,6 +93,7 @@ enum CliCommand {
     Excite(excite::Args),
     Hunt(hunt::Args),
     Identify(identify::Args),
+    ImportPolicy(import_policy::Args),
     List(list::Args),
     Log(log::Args),
     Mjcf(mjcf::Args),
@@ -135,6 +137,7 @@ fn main() -> std::process::ExitCode {
         CliCommand::Excite(args) => excite::run(&args),
         CliCommand::Hunt(args) => hunt::run(&args),
         CliCommand::Identify(args) => identify::run(&args),
+        CliCommand::ImportPolicy(args) => import_policy::run(&args),
         CliCommand::List(args) => list::run(&args),
         CliCommand::Log(args) => log::run(&args),
         CliCommand::Mjcf(args) => mjcf::run(&args),

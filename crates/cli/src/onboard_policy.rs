@@ -20,10 +20,10 @@ pub struct OnboardPolicy(JoinHandle<()>);
 
 impl OnboardPolicy {
     /// Compares the policy with the robot and starts to run it whenever the robot is ready.
-    pub fn start(path: &Path, factory: &RobotEnvFactory) -> Result<Self, Failure> {
+    pub fn start(path: &Path, mapping: Option<&Path>, factory: &RobotEnvFactory) -> Result<Self, Failure> {
         // A run has no time limit, and begins its episodes itself.
         let env = factory.build(1, AutoresetMode::Disabled, Some(u32::MAX)).map_err(input)?;
-        let policy = LoadedPolicy::read(path, None).map_err(input)?.bind(env.spec()).map_err(input)?;
+        let policy = LoadedPolicy::read(path, mapping).map_err(input)?.bind(env.spec()).map_err(input)?;
         let handle = factory.handle.clone();
         let thread = std::thread::Builder::new().name("policy".to_owned());
         Ok(Self(thread.spawn(move || run_when_ready(env, policy, &handle)).map_err(other)?))

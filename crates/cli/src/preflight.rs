@@ -7,9 +7,8 @@ use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::time::{Duration, Instant};
 
 use serde::Serialize;
-use twinstep_agent::LoadedPolicy;
-use twinstep_effects::ModelFile;
-use twinstep_envs::{Task, Walk};
+use twinstep_agent::{AgentError, LoadedPolicy};
+use twinstep_env_server::task_spec;
 use twinstep_robot::dds::Dds;
 use twinstep_robot::preflight::{Activity, Finding, PreflightReport, compare};
 use twinstep_robot::preflight_loop::{self, Event};
@@ -51,7 +50,13 @@ pub struct Args {
     /// Policy to compare with the robot.
     #[arg(long, value_name = "FILE")]
     policy: Option<PathBuf>,
-    /// Config file (TOML) with [task] and [safety], as for `twinstep robot`.
+    /// Mapping of the ONNX policy of another program (TOML).
+    #[arg(long, value_name = "FILE", requires = "policy")]
+    mapping: Option<PathBuf>,
+    /// Contract of the robot's endpoint, as for `twinstep robot`: a policy, a mapping or a TOML file with [control].
+    #[arg(long, value_name = "FILE")]
+    contract: Option<PathBuf>,
+    /// Config file (TOML) with [task], [safety] and [control], as for `twinstep robot`.
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
     /// Print one JSON object on stdout and nothing else.
@@ -79,13 +84,17 @@ struct JsonFinding<'a> {
 pub fn run(args: &Args) -> CommandResult {
     let handle = RobotHandle::default();
     let signals = StopSignals::listen(&handle)?;
-    let config = RobotConfig::load(args.config.as_deref())?;
-    let robot = ModelFile::default().robot_model().map_err(input)?;
-    let walk = Walk::new(config.walk()?, &robot, false).map_err(input)?;
+    let config = RobotConfig::load(args.config.as_deref(), args.contract.as_deref())?;
+    let robot = config.robot()?;
+    let spec = task_spec(&config.task, &robot, false).map_err(input)?;
     let mut findings = Vec::new();
     if let Some(path) = &args.policy {
-        let policy = LoadedPolicy::read(path, None).map_err(input)?;
-        findings.extend(policy.spec().map(|spec| compare(spec, walk.spec())).unwrap_or_default());
+        let policy = LoadedPolicy::read(path, args.mapping.as_deref()).map_err(input)?;
+        findings.extend(match policy.bind(&spec) {
+            Ok(_) => Vec::new(),
+            Err(AgentError::Disagreement { differences, .. }) => compare(&differences),
+            Err(error) => return Err(input(error)),
+        });
     }
     let fake = if args.fake { Some(FakeProcess::start(None, &["--released"])?) } else { None };
     let (domain, address) = match (&fake, &args.interface) {

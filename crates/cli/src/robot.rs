@@ -7,12 +7,15 @@ use std::time::Duration;
 
 use rustix::mm::MlockAllFlags;
 use serde::Deserialize;
-use twinstep_effects::ModelFile;
-use twinstep_env_server::{Server, ServerConfig, ServerError};
-use twinstep_envs::{TaskConfig, WalkConfig};
+use twinstep_agent::read_contract;
+use twinstep_effects::{ControlTable, ModelFile};
+use twinstep_env_server::{Server, ServerConfig, ServerError, check_measurable};
+use twinstep_envs::TaskConfig;
 use twinstep_model::{PerJoint, RobotModel};
 use twinstep_robot::dds::Dds;
-use twinstep_robot::{MotorLink, Recorder, RobotHandle, SafetyConfig, control_loop, interface_address, watch};
+use twinstep_robot::{
+    MotorLink, Recorder, RobotHandle, SafetyConfig, SafetyMachine, control_loop, interface_address, watch,
+};
 use twinstep_viewer::Hub;
 
 use crate::exit::{CommandResult, Failure, input, other};
@@ -64,10 +67,17 @@ pub struct Args {
     /// Run this policy next to the control loop instead of serving clients, with the velocity of the remote control.
     #[arg(long, value_name = "FILE")]
     policy: Option<PathBuf>,
+    /// Mapping of the ONNX policy of another program (TOML), for --policy.
+    #[arg(long, value_name = "FILE", requires = "policy")]
+    mapping: Option<PathBuf>,
+    /// Take gains, default pose, action scale and rates from this policy, mapping (TOML) or file with a table [control]. Clients
+    /// whose policy has other ones are refused. Default: those of --policy, of the config file, or of the built-in Go2.
+    #[arg(long, value_name = "FILE")]
+    contract: Option<PathBuf>,
     /// Record every message of the robot to this MCAP file, which must not exist.
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
-    /// Config file (TOML) with [server], [task] and [safety]. Flags override its values.
+    /// Config file (TOML) with [server], [task], [safety] and [control]. Flags override its values.
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
     /// Name of the robot, by which clients find it. Default: go2.
@@ -91,12 +101,14 @@ pub struct RobotConfig {
     pub server: ServerConfig,
     pub task: TaskConfig,
     pub safety: SafetyConfig,
+    /// The contract of the policy. Default: that of the built-in Go2.
+    pub control: Option<ControlTable>,
 }
 
 impl RobotConfig {
     /// Reads the config file, if there is one, and checks it.
-    pub fn load(path: Option<&Path>) -> Result<Self, Failure> {
-        let config: Self = match path {
+    pub fn load(path: Option<&Path>, contract: Option<&Path>) -> Result<Self, Failure> {
+        let mut config: Self = match path {
             Some(path) => {
                 let content = std::fs::read_to_string(path)
                     .map_err(|error| text(&format!("cannot read the config file {}: {error}", path.display())))?;
@@ -106,23 +118,26 @@ impl RobotConfig {
         };
         config.safety.check().map_err(input)?;
         config.task.check().map_err(input)?;
+        check_measurable(&config.task).map_err(input)?;
+        if let Some(contract) = contract {
+            config.control = Some(read_contract(contract).map_err(input)?);
+        }
         Ok(config)
     }
 
-    /// Returns the settings of the task `walk`, the only one of a robot.
-    pub fn walk(&self) -> Result<WalkConfig, Failure> {
-        match &self.task {
-            TaskConfig::Walk(walk) => Ok(walk.clone()),
-            other => Err(text(&format!("`task.name` = \"{}\" has no robot: use \"walk\"", other.name()))),
-        }
+    /// Returns the robot with the contract of the policy, whose gains must be within `[safety]`.
+    pub fn robot(&self) -> Result<RobotModel, Failure> {
+        let file = ModelFile::default().with_control(&self.control.clone().unwrap_or_default()).map_err(input)?;
+        let robot = file.robot_model().map_err(input)?;
+        SafetyMachine::new(&robot, self.safety.clone()).map_err(input)?;
+        Ok(robot)
     }
 }
 
 /// Serves the robot until a signal or `quit`.
 pub fn run(args: &Args) -> CommandResult {
     let config = args.config()?;
-    let robot = ModelFile::default().robot_model().map_err(input)?;
-    let task = config.walk()?;
+    let robot = config.robot()?;
     args.view.check()?;
     let handle = RobotHandle::default();
     let signals = StopSignals::listen(&handle)?;
@@ -139,11 +154,12 @@ pub fn run(args: &Args) -> CommandResult {
     report_panics(&handle);
     let dds = Dds::join(domain, address).map_err(input)?;
     let motors = start_motors(&dds, &config.safety)?;
-    let control = control_loop::start(&robot, config.safety, &dds, motors, handle.clone(), recorder).map_err(input)?;
+    let control =
+        control_loop::start(&robot, config.safety.clone(), &dds, motors, handle.clone(), recorder).map_err(input)?;
     let watch = watch::start(&dds, handle.clone()).map_err(other)?;
     let view = RobotView::start(&args.view, &robot, &handle);
     let outcome = view.and_then(|view| {
-        let outcome = args.serve(&config.server, (robot, task), &handle, view.hub());
+        let outcome = args.serve(&config, robot, &handle, view.hub());
         handle.end();
         view.join();
         outcome
@@ -171,8 +187,14 @@ pub fn start_motors(dds: &Dds, safety: &SafetyConfig) -> Result<MotorLink, Failu
 }
 
 impl Args {
+    /// Returns the file with the contract: by default that of the policy that runs here.
+    fn contract(&self) -> Option<&Path> {
+        let of_policy = self.mapping.as_deref().or(self.policy.as_deref());
+        self.contract.as_deref().or(of_policy)
+    }
+
     fn config(&self) -> Result<RobotConfig, Failure> {
-        let mut config = RobotConfig::load(self.config.as_deref())?;
+        let mut config = RobotConfig::load(self.config.as_deref(), self.contract())?;
         let server = &mut config.server;
         server.name = self.name.clone().or(server.name.take());
         if let Some(listen) = &self.listen {
@@ -183,24 +205,18 @@ impl Args {
         Ok(config)
     }
 
-    fn serve(
-        &self,
-        server: &ServerConfig,
-        (robot, task): (RobotModel, WalkConfig),
-        handle: &RobotHandle,
-        hub: &Arc<Hub>,
-    ) -> CommandResult {
+    fn serve(&self, config: &RobotConfig, robot: RobotModel, handle: &RobotHandle, hub: &Arc<Hub>) -> CommandResult {
         let torque_limits = &robot.torque_limits();
-        let factory = RobotEnvFactory { robot, task, handle: handle.clone() };
+        let factory = RobotEnvFactory { robot, task: config.task.clone(), handle: handle.clone() };
         if let Some(path) = &self.policy {
-            let policy = OnboardPolicy::start(path, &factory)?;
+            let policy = OnboardPolicy::start(path, self.mapping.as_deref(), &factory)?;
             let place = format!("policy {}", path.display());
             let result = watch_robot(handle, torque_limits, &place, Vec::new);
             handle.end();
             policy.join();
             return result;
         }
-        let server = Server::start(server, Arc::new(factory)).map_err(|error| match error {
+        let server = Server::start(&config.server, Arc::new(factory)).map_err(|error| match error {
             ServerError::ZenohConfig { .. } | ServerError::Setting { .. } => input(error),
             _ => other(error),
         })?;

@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 
 use glam::Quat;
 use indicatif::{ProgressBar, ProgressStyle};
+use twinstep_agent::read_contract;
 use twinstep_env_server::{Config, EnvFactory, Server, ServerConfig, ServerError, SimEnvFactory, TreeEnvFactory};
 use twinstep_envs::TaskConfig;
 use twinstep_model::{AutoresetMode, InitialState, Pose, ResetRequest, RobotModel, Scene};
@@ -89,6 +90,9 @@ pub struct Args {
     /// never.
     #[arg(long, value_name = "S")]
     lease_idle_s: Option<f64>,
+    /// Take gains, default pose, action scale and rates from this policy, mapping (TOML) or file with a table [control].
+    #[arg(long, value_name = "FILE")]
+    contract: Option<PathBuf>,
     /// Seed of environments that a client does not seed.
     #[arg(long)]
     seed: Option<u64>,
@@ -217,6 +221,9 @@ impl Args {
         config.sim.physics_hz = self.physics_hz.or(config.sim.physics_hz);
         config.randomise.effects |= self.randomise_effects;
         set(&mut config.sim.threads, self.threads.as_ref());
+        if let Some(path) = &self.contract {
+            config.control = Some(read_contract(path).map_err(input)?);
+        }
         config.check().map_err(input)?;
         Ok(config)
     }

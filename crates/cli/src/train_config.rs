@@ -90,6 +90,7 @@ impl TrainConfig {
             task: self.task.clone(),
             sim: SimConfig { threads, ..self.sim },
             randomise: self.randomise,
+            control: None,
         };
         config.check().map_err(input)?;
         SimEnvFactory::new(config).map_err(input)

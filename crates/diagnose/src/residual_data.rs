@@ -319,14 +319,15 @@ pub fn variance(values: &[f64]) -> f64 {
 ///
 /// It includes noise of the torque sensor, noise of positions and velocities in the PD loop, and model error.
 pub fn torque_sigma(log: &Log, robot: &RobotModel) -> [f64; NUM_JOINTS] {
-    JOINT_NAMES.map(|name| {
+    std::array::from_fn(|joint| {
+        let name = JOINT_NAMES[joint];
         let noise = |channel: &str, assumed: f64| {
             log.noise(&format!("{channel}_{name}")).filter(|sigma| *sigma > 0.0).unwrap_or(assumed)
         };
         let known = log.joints().iter().any(|joint| joint == name);
         let gain = |gain: Option<f64>, nominal: f64| gain.filter(|_| known).unwrap_or(nominal);
-        let kp = gain(log.kp(name, 0), robot.control.kp);
-        let kd = gain(log.kd(name, 0), robot.control.kd);
+        let kp = gain(log.kp(name, 0), robot.control.kp[joint]);
+        let kd = gain(log.kd(name, 0), robot.control.kd[joint]);
         let measured = noise("tau_measured", 0.2).hypot(MISFIT_NM);
         measured.hypot(kp * noise("q", 0.002)).hypot(kd * noise("dq", 0.05))
     })

@@ -30,7 +30,7 @@ pub use model_file::{
     ActuatorNetworkConfig, EffectEntryError, JointEffect, JointScope, MemberSampling, ModelFile, ModelFileError,
     NetworkMode, NominalGain, TreeModelFile, load_robot, parse_robot,
 };
-pub use nominal::{ControlTable, JointsTable, NominalRobot, NominalRobotError, is_robot_file};
+pub use nominal::{ControlTable, JointGains, JointsTable, KindGains, NominalRobot, NominalRobotError, is_robot_file};
 pub use sampler::{RobotSampler, SamplingError};
 pub use scope::{Scope, UnknownScope};
 pub use search::{BlindTestCondition, Probes, Search, Variable, Visibility};

@@ -4,7 +4,7 @@
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
-use twinstep_model::{ControlConfig, NUM_JOINTS, RobotModel, go2};
+use twinstep_model::{ControlConfig, Joint, JointKind, NUM_JOINTS, RobotModel, go2};
 use twinstep_robot_files::{QuadrupedNames, RobotFileError, quadruped, read_robot};
 
 /// Name of the built-in robot.
@@ -29,10 +29,10 @@ pub struct NominalRobot {
 pub struct ControlTable {
     /// Position gain [N·m/rad].
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub kp: Option<f64>,
+    pub kp: Option<JointGains>,
     /// Velocity gain [N·m·s/rad].
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub kd: Option<f64>,
+    pub kd: Option<JointGains>,
     /// Joint offset of an action of 1 [rad].
     #[serde(skip_serializing_if = "Option::is_none")]
     pub action_scale: Option<f64>,
@@ -45,6 +45,49 @@ pub struct ControlTable {
     /// Rate of the policy [Hz], of which `actuator_hz` is a multiple.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub policy_hz: Option<f64>,
+}
+
+/// A gain of all joints, of each kind of joint, or of each joint.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(
+    untagged,
+    expecting = "expected a number, twelve numbers in the order FL, FR, RL, RR; hip, thigh, calf, or a table with `hip`, `thigh` \
+                 and `calf`"
+)]
+pub enum JointGains {
+    /// The same for all joints.
+    All(f64),
+    /// One for each joint, in the order FL, FR, RL, RR; hip, thigh, calf.
+    Each([f64; NUM_JOINTS]),
+    /// One for each kind of joint.
+    Kinds(KindGains),
+}
+
+/// Gains by kind of joint.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct KindGains {
+    /// Hips.
+    pub hip: f64,
+    /// Thighs.
+    pub thigh: f64,
+    /// Calves.
+    pub calf: f64,
+}
+
+impl JointGains {
+    /// Returns the gain of each joint.
+    pub fn by_joint(&self) -> [f64; NUM_JOINTS] {
+        match self {
+            Self::All(gain) => [*gain; NUM_JOINTS],
+            Self::Each(gains) => *gains,
+            Self::Kinds(KindGains { hip, thigh, calf }) => Joint::ALL.map(|joint| match joint.kind {
+                JointKind::Hip => *hip,
+                JointKind::Thigh => *thigh,
+                JointKind::Calf => *calf,
+            }),
+        }
+    }
 }
 
 /// Table `[joints]`: names in a robot file that are not the Go2's.
@@ -140,6 +183,24 @@ impl NominalRobot {
     }
 }
 
+impl NominalRobot {
+    /// Returns the robot with other gains, rates, scale and pose. Keys that `control` lacks keep their values.
+    pub fn with_control(&self, control: &ControlTable) -> Result<Self, NominalRobotError> {
+        let own = self.control.clone().unwrap_or_default();
+        let control = ControlTable {
+            kp: control.kp.clone().or(own.kp),
+            kd: control.kd.clone().or(own.kd),
+            action_scale: control.action_scale.or(own.action_scale),
+            default_pose: control.default_pose.or(own.default_pose),
+            actuator_hz: control.actuator_hz.or(own.actuator_hz),
+            policy_hz: control.policy_hz.or(own.policy_hz),
+        };
+        let has_go2_names = self.joints.as_ref().is_none_or(|joints| joints.names.is_none());
+        let model = RobotModel { control: control.config(has_go2_names)?, ..self.model.clone() };
+        Ok(Self { control: Some(control), model, ..self.clone() })
+    }
+}
+
 /// Returns true if the name of a file is that of a robot file.
 pub fn is_robot_file(path: &Path) -> bool {
     path.extension().is_some_and(|end| end.eq_ignore_ascii_case("urdf") || end.eq_ignore_ascii_case("xml"))
@@ -154,6 +215,19 @@ impl ControlTable {
             let error = |found: String| NominalRobotError::Control { key, found, expected };
             let value = value.ok_or_else(|| error("missing".to_owned()))?;
             if allowed.contains(&value) { Ok(value) } else { Err(error(value.to_string())) }
+        };
+        let gains = |key,
+                     given: &Option<JointGains>,
+                     default: [f64; NUM_JOINTS],
+                     allowed: std::ops::RangeInclusive<f64>,
+                     expected| {
+            let gains = given.as_ref().map(JointGains::by_joint).or(is_go2.then_some(default));
+            let error = |found: String| NominalRobotError::Control { key, found, expected };
+            let gains = gains.ok_or_else(|| error("missing".to_owned()))?;
+            match gains.iter().find(|gain| !allowed.contains(gain)) {
+                Some(gain) => Err(error(gain.to_string())),
+                None => Ok(gains),
+            }
         };
         let policy_hz = default.actuator_hz / default.decimation as f64;
         let actuator_hz = number("actuator_hz", self.actuator_hz, default.actuator_hz, 20.0..=2000.0, "20 to 2000 Hz")?;
@@ -179,8 +253,8 @@ impl ControlTable {
             return Err(pose_error(value.to_string()));
         }
         Ok(ControlConfig {
-            kp: number("kp", self.kp, default.kp, 0.0..=1e5, "0 to 100000 N·m/rad")?,
-            kd: number("kd", self.kd, default.kd, 0.0..=1e4, "0 to 10000 N·m·s/rad")?,
+            kp: gains("kp", &self.kp, default.kp, 0.0..=1e5, "0 to 100000 N·m/rad")?,
+            kd: gains("kd", &self.kd, default.kd, 0.0..=1e4, "0 to 10000 N·m·s/rad")?,
             action_scale: number(
                 "action_scale",
                 self.action_scale,

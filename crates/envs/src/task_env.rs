@@ -65,7 +65,7 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
         let mut spec = task.spec().clone();
         spec.max_episode_steps = max_episode_steps.unwrap_or(spec.max_episode_steps);
         let (num_envs, control) = (backend.num_robots(), &robot.control);
-        let command = Command::hold(control.default_pose_f32(), control.kp as f32, control.kd as f32);
+        let command = control.hold(control.default_pose_f32());
         let not_started = |env: u64| Episode::not_started(&task, seed.wrapping_add(env));
         Ok(Self {
             noise: randomise.noise.entries(&spec),

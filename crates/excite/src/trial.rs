@@ -274,8 +274,8 @@ fn log(rows: &[Vec<f64>], spec: &EnvSpec) -> Result<Log, LogError> {
     let meta = Meta {
         policy_hz: Some(policy_hz),
         joints: spec.joint_order.clone(),
-        kp: Some(Gain::Uniform(spec.kp)),
-        kd: Some(Gain::Uniform(spec.kd)),
+        kp: Some(Gain::by_joint((0..spec.joint_order.len()).map(|joint| spec.gains(joint)[0]))),
+        kd: Some(Gain::by_joint((0..spec.joint_order.len()).map(|joint| spec.gains(joint)[1]))),
         source: Some("simulated run of twinstep excite".to_owned()),
         ..Meta::new(policy_hz, TorqueSensor::None, segments)
     };

@@ -235,14 +235,12 @@ impl CommandPlayer<'_> {
                     columns.push((format!("{quantity}_{name}"), cells.to_vec()));
                 }
             }
-            kp.push(given.and_then(|given| given.kp.clone()).unwrap_or_else(|| vec![control.kp; rows]));
-            kd.push(given.and_then(|given| given.kd.clone()).unwrap_or_else(|| vec![control.kd; rows]));
+            kp.push(given.and_then(|given| given.kp.clone()).unwrap_or_else(|| vec![control.kp[joint.index()]; rows]));
+            kd.push(given.and_then(|given| given.kd.clone()).unwrap_or_else(|| vec![control.kd[joint.index()]; rows]));
         }
         for (quantity, gains, constant) in [("kp", kp, &mut meta.kp), ("kd", kd, &mut meta.kd)] {
             if gains.iter().all(|cells| cells.iter().all(|cell| *cell == cells[0])) {
-                let first: Vec<_> = gains.iter().map(|cells| cells[0]).collect();
-                let same = first.iter().all(|gain| *gain == first[0]);
-                *constant = Some(if same { Gain::Uniform(first[0]) } else { Gain::PerJoint(first) });
+                *constant = Some(Gain::by_joint(gains.iter().map(|cells| cells[0])));
             } else {
                 let names = JOINT_NAMES.iter().map(|name| format!("{quantity}_{name}"));
                 columns.extend(names.zip(gains));

@@ -86,7 +86,8 @@ pub struct Robots {
     default_pose: PerJoint,
     torque_limits: PerJoint,
     action_scale: f32,
-    gains: [f32; 2],
+    /// Position and velocity gain by joint.
+    gains: Vec<[f32; 2]>,
 }
 
 impl Robots {
@@ -116,15 +117,15 @@ impl Robots {
             default_pose: robot.control.default_pose_f32(),
             torque_limits: robot.torque_limits(),
             action_scale: spec.action_scale as f32,
-            gains: [spec.kp as f32, spec.kd as f32],
+            gains: (0..NUM_JOINTS).map(|joint| spec.gains(joint).map(|gain| gain as f32)).collect(),
         })
     }
 
     /// Returns the mechanical power of all motors at the end of a step, without that of braking ones [W].
     fn power(&self, obs: &[f32]) -> f32 {
         let [q, dq, action] = [self.q, self.dq, self.action].map(|start| &obs[start..start + NUM_JOINTS]);
-        let [kp, kd] = self.gains;
         let joint_power = |joint: usize| {
+            let [kp, kd] = self.gains[joint];
             let tau = kp * (self.action_scale * action[joint] - q[joint]) - kd * dq[joint];
             let limit = self.torque_limits[joint];
             (tau.clamp(-limit, limit) * dq[joint]).max(0.0)

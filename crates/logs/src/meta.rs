@@ -96,6 +96,17 @@ pub enum Gain {
     PerJoint(Vec<f64>),
 }
 
+impl Gain {
+    /// Returns the gains of joints in the order of [`Meta::joints`].
+    pub fn by_joint(gains: impl IntoIterator<Item = f64>) -> Self {
+        let gains = Vec::from_iter(gains);
+        match gains.first() {
+            Some(first) if gains.iter().all(|gain| gain == first) => Self::Uniform(*first),
+            _ => Self::PerJoint(gains),
+        }
+    }
+}
+
 impl Meta {
     /// Creates metadata with the required values only.
     pub fn new(rate_hz: f64, tau_sensor: TorqueSensor, segments: Vec<Segment>) -> Meta {

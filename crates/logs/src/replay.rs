@@ -145,7 +145,7 @@ pub fn joint_commands(log: &Log) -> Result<Vec<JointCommands<'_>>, ReplayError> 
 /// Joints that the log lacks hold the default pose. Missing velocities and feed-forward torques are zero.
 pub fn command(robot: &RobotModel, joints: &[JointCommands], row: usize) -> Command {
     let control = &robot.control;
-    let mut command = Command::hold(control.default_pose_f32(), control.kp as f32, control.kd as f32);
+    let mut command = control.hold(control.default_pose_f32());
     for joint in joints {
         let index = joint.joint.index();
         command.q[index] = joint.q_cmd[row] as f32;

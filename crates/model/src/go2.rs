@@ -9,7 +9,7 @@ use glam::{DQuat, DVec3, dvec3};
 
 use crate::{
     ActuatorParams, CONTACT, ControlConfig, Derating, Joint, JointKind, JointModel, JointSpring, Leg, LegModel,
-    RigidBody, RobotModel, Shapes, Stribeck,
+    NUM_JOINTS, RigidBody, RobotModel, Shapes, Stribeck,
 };
 
 /// Returns the ideal Go2: without joint friction, damping or delay.
@@ -116,7 +116,14 @@ fn control() -> ControlConfig {
         JointKind::Thigh => 1.0,
         JointKind::Calf => -1.5,
     });
-    ControlConfig { kp: 30.0, kd: 0.75, action_scale: 0.5, default_pose, actuator_hz: 200.0, decimation: 4 }
+    ControlConfig {
+        kp: [30.0; NUM_JOINTS],
+        kd: [0.75; NUM_JOINTS],
+        action_scale: 0.5,
+        default_pose,
+        actuator_hz: 200.0,
+        decimation: 4,
+    }
 }
 
 fn quat_wxyz([w, x, y, z]: [f64; 4]) -> DQuat {

@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 
-use crate::{Joint, NUM_JOINTS, NUM_LEGS, PerJoint, RigidBody};
+use crate::{Command, Joint, NUM_JOINTS, NUM_LEGS, PerJoint, RigidBody};
 
 /// Robot with the kinematic tree of the Go2: a trunk and four legs of hip, thigh and calf.
 #[derive(Clone, Debug, PartialEq)]
@@ -261,10 +261,10 @@ pub const CONTACT: Contact = Contact { friction: 0.8, time_constant: 0.002, damp
 /// Conversion of a policy's actions to commands: gains, scale, default pose and rates.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ControlConfig {
-    /// Position gain [N·m/rad].
-    pub kp: f64,
-    /// Velocity gain [N·m·s/rad].
-    pub kd: f64,
+    /// Position gain by joint [N·m/rad].
+    pub kp: [f64; NUM_JOINTS],
+    /// Velocity gain by joint [N·m·s/rad].
+    pub kd: [f64; NUM_JOINTS],
     /// Joint offset of an action of 1 [rad].
     pub action_scale: f64,
     /// Joint positions to which actions are relative [rad].
@@ -284,6 +284,21 @@ impl ControlConfig {
     /// Returns the policy period [s].
     pub fn policy_dt(&self) -> f64 {
         self.decimation as f64 / self.actuator_hz
+    }
+
+    /// Returns position gain [N·m/rad] and velocity gain [N·m·s/rad] of each joint, or nothing if those of all are equal.
+    pub fn joint_gains(&self) -> Vec<[f64; 2]> {
+        let gains = |joint: usize| [self.kp[joint], self.kd[joint]];
+        if (1..NUM_JOINTS).all(|joint| gains(joint) == gains(0)) {
+            return Vec::new();
+        }
+        (0..NUM_JOINTS).map(gains).collect()
+    }
+
+    /// Returns the command that holds positions [rad] with these gains.
+    pub fn hold(&self, q: PerJoint) -> Command {
+        let single = |gains: [f64; NUM_JOINTS]| gains.map(|gain| gain as f32);
+        Command { q, dq: [0.0; NUM_JOINTS], tau_ff: [0.0; NUM_JOINTS], kp: single(self.kp), kd: single(self.kd) }
     }
 
     /// Returns the default pose in single precision [rad].

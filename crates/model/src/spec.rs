@@ -67,6 +67,11 @@ pub struct EnvSpec {
 }
 
 impl EnvSpec {
+    /// Returns position gain [N·m/rad] and velocity gain [N·m·s/rad] of a joint.
+    pub fn gains(&self, joint: usize) -> [f64; 2] {
+        self.joint_gains.get(joint).copied().unwrap_or([self.kp, self.kd])
+    }
+
     /// Returns the length of one observation of group `policy`.
     pub fn obs_len(&self) -> usize {
         self.observation.iter().map(|field| field.size).sum()
@@ -105,14 +110,21 @@ impl EnvSpec {
     /// Returns each quantity of [`EnvSpec::hash_input`] that differs from that of `other`, one per line of the text.
     pub fn differences(&self, other: &EnvSpec) -> Vec<SpecDifference> {
         let (ours, theirs) = (self.hash_input(), other.hash_input());
-        let pairs = ours.lines().zip(theirs.lines()).filter(|(ours, theirs)| ours != theirs);
-        pairs
-            .map(|(ours, theirs)| {
-                let value = |line: &str| line.split_once(' ').unwrap_or_default().1.to_owned();
-                let quantity = ours.split(' ').next().unwrap_or_default().to_owned();
-                SpecDifference { quantity, values: [value(ours), value(theirs)] }
-            })
-            .collect()
+        // Only specs whose joints have different gains have a line for them.
+        let quantity = |line: &'_ str| line.split(' ').next().unwrap_or_default().to_owned();
+        let mut quantities: Vec<String> = ours.lines().chain(theirs.lines()).map(quantity).collect();
+        let mut seen = std::collections::BTreeSet::new();
+        quantities.retain(|quantity| seen.insert(quantity.clone()));
+        let value = |text: &str, quantity: &str, spec: &Self| {
+            let line = text.lines().find(|line| line.split(' ').next() == Some(quantity));
+            let equal = || format!("{}:{} for every joint", spec.kp, spec.kd);
+            line.map_or_else(equal, |line| line.split_once(' ').unwrap_or_default().1.to_owned())
+        };
+        let all = quantities.into_iter().map(|quantity| {
+            let values = [value(&ours, &quantity, self), value(&theirs, &quantity, other)];
+            SpecDifference { quantity, values }
+        });
+        all.filter(|SpecDifference { values: [one, other], .. }| one != other).collect()
     }
 
     /// Returns the hash of all that an agent and a robot must agree on, as 32 hexadecimal digits.

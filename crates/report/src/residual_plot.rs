@@ -152,7 +152,7 @@ fn commanded_torque(log: &Log, robot: &RobotModel, joint: &JointCommands, kinema
     let gain = |gains: &Option<Vec<f64>>, row: usize, model: f64| gains.as_ref().map_or(model, |gains| gains[row]);
     let of = |row: usize| {
         let [dq_cmd, tau_ff] = [joint.dq_cmd, joint.tau_ff].map(|column| f64::from(cell_or_zero(column, row)));
-        let (kp, kd) = (gain(&joint.kp, row, robot.control.kp), gain(&joint.kd, row, robot.control.kd));
+        let (kp, kd) = (gain(&joint.kp, row, robot.control.kp[index]), gain(&joint.kd, row, robot.control.kd[index]));
         kp * (joint.q_cmd[row] - q[row]) + kd * (dq_cmd - kinematics.dq[index][row]) + tau_ff
     };
     (0..q.len()).map(of).collect()

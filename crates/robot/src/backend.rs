@@ -48,7 +48,7 @@ impl RobotBackend {
             stop: None,
         };
         let period = Duration::from_secs_f64(robot.control.actuator_dt());
-        let resampler = Resampler::new(period, robot.control.kp as f32);
+        let resampler = Resampler::new(period, robot.control.kp[0] as f32);
         let measured = Measured::default();
         let mut backend = Self { handle, robot, measured, report, action_tick: None, remote: None, resampler };
         backend.observe(&Board::default());

@@ -32,7 +32,7 @@ pub struct SafetyMachine {
     config: SafetyConfig,
     limits: CommandLimits,
     /// Position and velocity gain of the policy.
-    gains: [f32; 2],
+    gains: [PerJoint; 2],
     action_scale: f32,
     default_pose: PerJoint,
     crouched_pose: PerJoint,
@@ -79,12 +79,12 @@ impl SafetyMachine {
         config.check()?;
         let limits = CommandLimits::new(robot, &config);
         let (control, default_pose) = (&robot.control, robot.control.default_pose_f32());
-        let gains = [control.kp as f32, control.kd as f32];
-        limits.check(&Command::hold(default_pose, gains[0], gains[1]))?;
+        let hold = control.hold(default_pose);
+        limits.check(&hold)?;
         // The position does not matter at a gain of 0, but it must be in the limits like every other.
         let damping = limits.check(&Command::hold(default_pose, 0.0, config.damping_kd))?;
         Ok(Self {
-            gains,
+            gains: [hold.kp, hold.kd],
             action_scale: control.action_scale as f32,
             default_pose,
             crouched_pose: limits.clamp(Joint::map_kinds(CROUCH[0], CROUCH[1], CROUCH[2])),
@@ -358,10 +358,11 @@ impl SafetyMachine {
             return self.state().is_armed().then_some(self.damping);
         };
         let standing = self.standing_share();
-        let blend = |policy: f32, kinds: [f32; 3]| {
-            Joint::map_kinds(kinds[0], kinds[1], kinds[2]).map(|stand| policy + standing * (stand - policy))
+        let blend = |policy: &PerJoint, kinds: [f32; 3]| {
+            let stand = Joint::map_kinds(kinds[0], kinds[1], kinds[2]);
+            std::array::from_fn(|joint| policy[joint] + standing * (stand[joint] - policy[joint]))
         };
-        let (kp, kd) = (blend(self.gains[0], self.config.stand_kp), blend(self.gains[1], self.config.stand_kd));
+        let (kp, kd) = (blend(&self.gains[0], self.config.stand_kp), blend(&self.gains[1], self.config.stand_kd));
         let command = Command { q, dq: [0.0; NUM_JOINTS], tau_ff: [0.0; NUM_JOINTS], kp, kd };
         Some(self.limits.check(&command).unwrap_or_else(|error| {
             self.react(Fault::UnsafeCommand(error));

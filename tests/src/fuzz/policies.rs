@@ -89,7 +89,10 @@ fn read_policy(path: &Path) -> Outcome {
 
 fn read_onnx(path: &Path) -> Outcome {
     match OnnxNetwork::read(path) {
-        Ok(network) => Outcome::checked(network.run(&vec![0.5; network.inputs()]).is_ok()),
+        Ok(network) => {
+            let inputs: Vec<Vec<f32>> = network.inputs().iter().map(|port| vec![0.5; port.len()]).collect();
+            Outcome::checked(network.run(&inputs.iter().map(Vec::as_slice).collect::<Vec<_>>()).is_ok())
+        }
         Err(error) => {
             assert!(!error.to_string().is_empty(), "an error has a text");
             Outcome::Refused

@@ -9,7 +9,13 @@ use crate::onnx::tensor::Tensor;
 /// `TensorProto.DataType`.
 pub const FLOAT: i64 = 1;
 /// `TensorProto.DataType`.
+pub const INT32: i64 = 6;
+/// `TensorProto.DataType`.
 pub const INT64: i64 = 7;
+/// `TensorProto.DataType`.
+pub const BOOL: i64 = 9;
+/// `TensorProto.DataType`.
+pub const DOUBLE: i64 = 11;
 
 /// Content of an ONNX file.
 #[derive(Clone, Debug, Default)]
@@ -20,7 +26,7 @@ pub struct Graph {
     pub constants: HashMap<String, Tensor>,
     /// Inputs that are not constants.
     pub inputs: Vec<Input>,
-    /// Names of the outputs.
+    /// Names of the outputs of the graph.
     pub outputs: Vec<String>,
     /// Metadata of the file.
     pub metadata: BTreeMap<String, String>,
@@ -50,6 +56,10 @@ pub struct Attribute {
     pub floats: Vec<f32>,
     /// Integers.
     pub integers: Vec<i64>,
+    /// A text.
+    pub text: Option<String>,
+    /// Texts.
+    pub texts: Vec<String>,
     /// An array.
     pub tensor: Option<Tensor>,
 }
@@ -127,8 +137,10 @@ fn read_attribute(bytes: &[u8], folder: &Path) -> Result<(String, Attribute), St
             (1, _) => name = value.text()?,
             (2, Value::Fixed32(bytes)) => attribute.float = Some(f32::from_le_bytes(bytes)),
             (3, _) => attribute.integer = Some(value.integer()?),
+            (4, _) => attribute.text = Some(value.text()?),
             (5, _) => attribute.tensor = Some(read_tensor(value.bytes()?, folder)?.1),
             (7, _) => value.floats(&mut attribute.floats)?,
+            (9, _) => attribute.texts.push(value.text()?),
             (8, _) => value.integers(&mut attribute.integers)?,
             _ => {}
         }
@@ -139,13 +151,15 @@ fn read_attribute(bytes: &[u8], folder: &Path) -> Result<(String, Attribute), St
 /// Returns name and value of a `TensorProto`.
 fn read_tensor(bytes: &[u8], folder: &Path) -> Result<(String, Tensor), String> {
     let (mut name, mut kind, mut dimensions) = (String::new(), 0, Vec::new());
-    let (mut floats, mut integers, mut raw, mut external) = (Vec::new(), Vec::new(), Vec::new(), BTreeMap::new());
+    let (mut floats, mut doubles, mut integers) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut raw, mut external) = (Vec::new(), BTreeMap::new());
     for (number, value) in fields(bytes)? {
         match number {
             1 => value.integers(&mut dimensions)?,
             2 => kind = value.integer()?,
             4 => value.floats(&mut floats)?,
-            7 => value.integers(&mut integers)?,
+            5 | 7 => value.integers(&mut integers)?,
+            10 => value.doubles(&mut doubles)?,
             8 => name = value.text()?,
             9 => raw = value.bytes()?.to_vec(),
             13 => external.extend([read_entry(value.bytes()?)?]),
@@ -162,11 +176,24 @@ fn read_tensor(bytes: &[u8], folder: &Path) -> Result<(String, Tensor), String> 
             floats.extend(raw.as_chunks().0.iter().map(|bytes| f32::from_le_bytes(*bytes)));
             Tensor::floats(shape, floats)
         }
+        DOUBLE => {
+            doubles.extend(raw.as_chunks().0.iter().map(|bytes| f64::from_le_bytes(*bytes)));
+            Tensor::floats(shape, doubles.into_iter().map(|number| number as f32).collect())
+        }
         INT64 => {
             integers.extend(raw.as_chunks().0.iter().map(|bytes| i64::from_le_bytes(*bytes)));
             Tensor::integers(shape, integers)
         }
-        _ => Err(format!("numbers of type {kind}; 32-bit floats (1) and 64-bit integers (7) are supported")),
+        INT32 => {
+            integers.extend(raw.as_chunks().0.iter().map(|bytes| i64::from(i32::from_le_bytes(*bytes))));
+            // Numbers of 32 bits are written with or without their sign.
+            Tensor::integers(shape, integers.into_iter().map(|number| i64::from(number as i32)).collect())
+        }
+        BOOL => {
+            integers.extend(raw.iter().map(|byte| i64::from(*byte)));
+            Tensor::integers(shape, integers.into_iter().map(|number| i64::from(number != 0)).collect())
+        }
+        _ => Err(format!("numbers of type {kind}; floats (1, 11), integers (6, 7) and truth values (9) are supported")),
     };
     tensor.map(|tensor| (name.clone(), tensor)).map_err(|problem| format!("`{name}` has {problem}"))
 }

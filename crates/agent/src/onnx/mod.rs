@@ -1,7 +1,11 @@
-//! ONNX files with one observation as input and an action as first output.
+//! ONNX files of policies: any number of inputs and outputs of floats.
 //!
-//! Networks of policies consist of few operators on small arrays, so a plain evaluation of the graph takes less than a
-//! millisecond. A library that evaluates any network, tract 0.23, took 16 minutes of processor time to compile.
+//! - [`OnnxNetwork`]: the evaluator. Its [`Port`]s are the inputs and outputs.
+//! - [`graph`]: what the file says. [`operators`]: what an operation computes, in plain loops over [`Tensor`]s.
+//!
+//! Networks of policies are small, so that plain loops take microseconds. The library rten 0.27 was tried in their place: it
+//! is as fast, but adds two minutes of processor time to the build and 6 MB to the program, has no bound of memory, and does
+//! not come back from a file of which a byte was changed. tract 0.23 took 16 minutes of processor time to compile.
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
@@ -10,26 +14,60 @@ mod graph;
 mod operators;
 mod protobuf;
 mod tensor;
+#[cfg(test)]
+mod tests;
 
 use graph::{FLOAT, Graph, Input, Node};
-use tensor::Tensor;
+use tensor::{Tensor, len};
 
-/// Largest length of an observation.
-const MAX_INPUTS: i64 = 1 << 20;
+/// Most entries of an input.
+const MAX_INPUT: usize = 1 << 20;
 /// Maximum number of entries of all arrays that an evaluation computes.
 const MAX_ENTRIES: usize = 1 << 26;
 
-/// Network of an ONNX file. The first output is the action; others are ignored.
+/// Network of an ONNX file.
 #[derive(Clone, Debug)]
 pub struct OnnxNetwork {
     path: PathBuf,
-    nodes: Vec<Node>,
-    constants: HashMap<String, Tensor>,
-    input: String,
-    output: String,
-    inputs: usize,
-    outputs: usize,
+    operations: Vec<Operation>,
+    /// Constants in their places; `None` for values that an evaluation computes.
+    constants: Vec<Option<Tensor>>,
+    inputs: Vec<Port>,
+    outputs: Vec<Port>,
     metadata: BTreeMap<String, String>,
+}
+
+/// An input or output of a network.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Port {
+    /// Name in the file.
+    pub name: String,
+    /// Length of each dimension; that of a batch, which the file leaves open, is 1.
+    pub shape: Vec<usize>,
+    /// Place of its value.
+    place: usize,
+}
+
+impl Port {
+    /// Returns the number of entries.
+    pub fn len(&self) -> usize {
+        self.shape.iter().product()
+    }
+
+    /// Returns true if the port has no entries.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+}
+
+/// An operation with the places of its values.
+#[derive(Clone, Debug)]
+struct Operation {
+    node: Node,
+    inputs: Vec<Option<usize>>,
+    outputs: Vec<Option<usize>>,
+    /// Places whose last use is this operation.
+    last_uses: Vec<usize>,
 }
 
 /// Reasons why an ONNX file cannot be read or evaluated.
@@ -51,10 +89,10 @@ pub enum OnnxError {
         /// What is wrong.
         problem: String,
     },
-    /// The file has other inputs than one observation.
+    /// An input is not an array of floats.
     #[error(
-        "{} has the inputs {found}; one observation of 32-bit floats, [1, n] or [batch, n], is expected\n  recurrent policies \
-         with a state among their inputs are not supported",
+        "{} has the inputs {found}; arrays of 32-bit floats with a batch of 1 are expected\n  an observation is [1, n] or \
+         [batch, n], the state of a recurrent network [layers, 1, n]",
         path.display()
     )]
     Inputs {
@@ -63,21 +101,15 @@ pub enum OnnxError {
         /// Name, type and shape of every input.
         found: String,
     },
-    /// The first output is not one action.
-    #[error("{} has a first output with the dimensions {found:?}; one action, [1, n], is expected", path.display())]
-    Output {
-        /// The file.
-        path: PathBuf,
-        /// Dimensions of the first output.
-        found: Vec<usize>,
-    },
     /// An operation cannot be evaluated.
-    #[error("{}: operator {operator} {problem}", path.display())]
+    #[error("{}: operator {operator}, which makes `{output}`, {problem}", path.display())]
     Operation {
         /// The file.
         path: PathBuf,
         /// Name of the operator.
         operator: String,
+        /// Name of its first output.
+        output: String,
         /// What is wrong.
         problem: String,
     },
@@ -90,26 +122,90 @@ impl OnnxNetwork {
         let bytes = std::fs::read(&path).map_err(|cause| OnnxError::File { path: path.clone(), cause })?;
         let content = |problem| OnnxError::Content { path: path.clone(), problem };
         let graph = graph::read(&bytes, path.parent().unwrap_or(Path::new(""))).map_err(content)?;
-        let (input, inputs) = observation(&graph).map_err(|found| OnnxError::Inputs { path: path.clone(), found })?;
-        let output = graph.outputs.first().cloned().ok_or_else(|| content("it has no output".to_owned()))?;
-        let Graph { nodes, constants, metadata, .. } = graph;
-        let mut network = Self { path, nodes, constants, input, output, inputs, outputs: 0, metadata };
-        let action = network.evaluate(&vec![0.0; inputs])?;
-        match action.shape[..] {
-            [1, outputs] if outputs > 0 && action.as_floats().is_ok() => network.outputs = outputs,
-            _ => return Err(OnnxError::Output { path: network.path, found: action.shape }),
+        let mut network = Self::compile(graph, path)?;
+        let zeros: Vec<Vec<f32>> = network.inputs.iter().map(|input| vec![0.0; input.len()]).collect();
+        let outputs = network.evaluate(&zeros.iter().map(Vec::as_slice).collect::<Vec<_>>())?;
+        for (port, output) in network.outputs.iter_mut().zip(&outputs) {
+            port.shape.clone_from(&output.shape);
         }
         Ok(network)
     }
 
-    /// Returns the length of the observation.
-    pub fn inputs(&self) -> usize {
-        self.inputs
+    /// Gives each value a place, and evaluates what depends on constants alone.
+    fn compile(graph: Graph, path: PathBuf) -> Result<Self, OnnxError> {
+        let inputs = ports(&graph).map_err(|found| OnnxError::Inputs { path: path.clone(), found })?;
+        let Graph { nodes, constants: weights, outputs, metadata, .. } = graph;
+        let mut places: HashMap<String, usize> = HashMap::new();
+        let mut constants: Vec<Option<Tensor>> = Vec::new();
+        let mut inputs: Vec<Port> = inputs;
+        for input in &mut inputs {
+            input.place = constants.len();
+            places.insert(input.name.clone(), input.place);
+            constants.push(None);
+        }
+        for (name, tensor) in weights {
+            places.insert(name, constants.len());
+            constants.push(Some(tensor));
+        }
+        let (mut operations, mut entries) = (Vec::new(), 0);
+        for node in nodes {
+            let failed = |problem| failure(&path, &node, problem);
+            let place = |name: &String| {
+                let found = places.get(name).copied();
+                let problem = || failed(format!("reads `{name}`, which does not exist before it"));
+                if name.is_empty() { Ok(None) } else { found.map(Some).ok_or_else(problem) }
+            };
+            let read = node.inputs.iter().map(place).collect::<Result<Vec<_>, _>>()?;
+            let is_constant = read.iter().flatten().all(|place| constants[*place].is_some());
+            let results = if is_constant {
+                let values: Vec<_> =
+                    read.iter().map(|place| place.and_then(|place| constants[place].as_ref())).collect();
+                let results = operators::evaluate(&node, &values).map_err(failed)?;
+                count(&results, &mut entries).map_err(failed)?;
+                Some(results)
+            } else {
+                None
+            };
+            let first = constants.len();
+            let written: Vec<Option<usize>> = (0..node.outputs.len())
+                .map(|index| (!node.outputs[index].is_empty()).then_some(first + index))
+                .collect();
+            for (index, name) in node.outputs.iter().enumerate() {
+                constants.push(results.as_ref().and_then(|results| results.get(index).cloned()));
+                places.insert(name.clone(), first + index);
+            }
+            if results.is_none() {
+                operations.push(Operation { node, inputs: read, outputs: written, last_uses: Vec::new() });
+            }
+        }
+        let port = |name: &String| {
+            let place = places.get(name).copied();
+            place.map(|place| Port { name: name.clone(), shape: Vec::new(), place }).ok_or_else(|| OnnxError::Content {
+                path: path.clone(),
+                problem: format!("no operation computes its output `{name}`"),
+            })
+        };
+        let outputs = outputs.iter().map(port).collect::<Result<Vec<_>, _>>()?;
+        if outputs.is_empty() {
+            return Err(OnnxError::Content { path, problem: "it has no output".to_owned() });
+        }
+        mark_last_uses(&mut operations, &outputs, constants.len());
+        Ok(Self { path, operations, constants, inputs, outputs, metadata })
     }
 
-    /// Returns the length of the action.
-    pub fn outputs(&self) -> usize {
-        self.outputs
+    /// Returns the file.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Returns the inputs.
+    pub fn inputs(&self) -> &[Port] {
+        &self.inputs
+    }
+
+    /// Returns the outputs; the first one is the action, [1, n].
+    pub fn outputs(&self) -> &[Port] {
+        &self.outputs
     }
 
     /// Returns an entry of the file's metadata.
@@ -117,62 +213,89 @@ impl OnnxNetwork {
         self.metadata.get(key).map(String::as_str)
     }
 
-    /// Returns the first output for an observation of [`OnnxNetwork::inputs`] numbers.
-    pub fn run(&self, obs: &[f32]) -> Result<Vec<f32>, OnnxError> {
-        let action = self.evaluate(obs)?;
-        let problem = |problem| OnnxError::Content { path: self.path.clone(), problem };
-        action.as_floats().map(<[f32]>::to_vec).map_err(problem)
+    /// Returns all outputs for the values of all inputs, each with [`Port::len`] numbers.
+    pub fn run(&self, inputs: &[&[f32]]) -> Result<Vec<Vec<f32>>, OnnxError> {
+        Ok(self.evaluate(inputs)?.iter().map(Tensor::to_floats).collect())
     }
 
-    /// Returns the index of the last operation that reads each value.
-    fn last_uses(&self) -> HashMap<&str, usize> {
-        let uses = self.nodes.iter().enumerate();
-        uses.flat_map(|(index, node)| node.inputs.iter().map(move |name| (name.as_str(), index))).collect()
-    }
-
-    fn evaluate(&self, obs: &[f32]) -> Result<Tensor, OnnxError> {
+    fn evaluate(&self, inputs: &[&[f32]]) -> Result<Vec<Tensor>, OnnxError> {
         let content = |problem| OnnxError::Content { path: self.path.clone(), problem };
-        let obs = Tensor::floats(vec![1, self.inputs], obs.to_vec()).map_err(content)?;
-        let mut values: HashMap<&str, Tensor> = HashMap::from([(self.input.as_str(), obs)]);
-        let last_uses = self.last_uses();
-        let mut entries = 0;
-        for (index, node) in self.nodes.iter().enumerate() {
-            let operation =
-                |problem| OnnxError::Operation { path: self.path.clone(), operator: node.operator.clone(), problem };
-            let value = |name: &String| {
-                let found = values.get(name.as_str()).or_else(|| self.constants.get(name));
-                found.ok_or_else(|| operation(format!("reads `{name}`, which does not exist before it")))
-            };
-            let inputs = node.inputs.iter().map(|name| if name.is_empty() { Ok(None) } else { value(name).map(Some) });
-            let inputs = inputs.collect::<Result<Vec<_>, _>>()?;
-            let result = operators::evaluate(node, &inputs).map_err(operation)?;
-            entries += result.shape.iter().product::<usize>();
-            if entries > MAX_ENTRIES {
-                return Err(operation(format!("makes the arrays of one evaluation longer than {MAX_ENTRIES} numbers")));
-            }
-            if let Some(name) = node.outputs.first() {
-                values.insert(name, result);
-            }
-            values.retain(|name, _| last_uses.get(name).is_some_and(|last| *last > index) || *name == self.output);
+        let mut values: Vec<Option<Tensor>> = vec![None; self.constants.len()];
+        if inputs.len() != self.inputs.len() {
+            return Err(content(format!("{} inputs were given; it has {}", inputs.len(), self.inputs.len())));
         }
-        values
-            .remove(self.output.as_str())
-            .ok_or_else(|| content(format!("no operation computes its output `{}`", self.output)))
+        for (port, input) in self.inputs.iter().zip(inputs) {
+            values[port.place] = Some(Tensor::floats(port.shape.clone(), input.to_vec()).map_err(content)?);
+        }
+        let mut entries = 0;
+        for Operation { node, inputs, outputs, last_uses } in &self.operations {
+            let failed = |problem| failure(&self.path, node, problem);
+            let value = |place: usize| values[place].as_ref().or(self.constants[place].as_ref());
+            let read: Vec<_> = inputs.iter().map(|place| place.and_then(value)).collect();
+            let results = operators::evaluate(node, &read).map_err(failed)?;
+            count(&results, &mut entries).map_err(failed)?;
+            for (place, result) in outputs.iter().zip(results) {
+                if let Some(place) = place {
+                    values[*place] = Some(result);
+                }
+            }
+            for place in last_uses {
+                values[*place] = None;
+            }
+        }
+        let output = |port: &Port| {
+            let value = values[port.place].clone().or_else(|| self.constants[port.place].clone());
+            value.ok_or_else(|| content(format!("no operation computes its output `{}`", port.name)))
+        };
+        self.outputs.iter().map(output).collect()
     }
 }
 
-/// Returns name and length of the only input. Returns a description of all inputs if there is not one observation.
-fn observation(graph: &Graph) -> Result<(String, usize), String> {
-    let described = || graph.inputs.iter().map(description).collect::<Vec<_>>().join(", ");
-    let [input] = &graph.inputs[..] else {
-        return Err(if graph.inputs.is_empty() { "none".to_owned() } else { described() });
-    };
-    match input.shape[..] {
-        [Some(1) | None, Some(len)] if input.kind == FLOAT && (1..=MAX_INPUTS).contains(&len) => {
-            Ok((input.name.clone(), len as usize))
-        }
-        _ => Err(described()),
+fn failure(path: &Path, node: &Node, problem: String) -> OnnxError {
+    OnnxError::Operation {
+        path: path.to_owned(),
+        operator: node.operator.clone(),
+        output: node.outputs.first().cloned().unwrap_or_default(),
+        problem,
     }
+}
+
+/// Adds the entries of arrays to those of an evaluation. Fails if they are too many.
+fn count(results: &[Tensor], entries: &mut usize) -> Result<(), String> {
+    *entries += results.iter().map(Tensor::len).sum::<usize>();
+    if *entries > MAX_ENTRIES {
+        return Err(format!("makes the arrays of one evaluation longer than {MAX_ENTRIES} numbers"));
+    }
+    Ok(())
+}
+
+fn mark_last_uses(operations: &mut [Operation], outputs: &[Port], places: usize) {
+    let mut is_needed = vec![false; places];
+    outputs.iter().for_each(|port| is_needed[port.place] = true);
+    for operation in operations.iter_mut().rev() {
+        for place in operation.inputs.iter().chain(&operation.outputs).flatten() {
+            if !std::mem::replace(&mut is_needed[*place], true) {
+                operation.last_uses.push(*place);
+            }
+        }
+    }
+}
+
+/// Returns the inputs. Returns a description of all of them if one is no array of floats.
+fn ports(graph: &Graph) -> Result<Vec<Port>, String> {
+    let described = || graph.inputs.iter().map(description).collect::<Vec<_>>().join(", ");
+    let port = |input: &Input| {
+        let lengths: Option<Vec<usize>> =
+            input.shape.iter().map(|len| usize::try_from(len.unwrap_or(1)).ok().filter(|len| *len > 0)).collect();
+        let shape = lengths.filter(|shape| len(shape).is_ok_and(|len| len <= MAX_INPUT))?;
+        // The length of an observation is known; only its batch may be open.
+        let is_known = input.shape.last().is_some_and(Option::is_some);
+        (input.kind == FLOAT && is_known).then(|| Port { name: input.name.clone(), shape, place: 0 })
+    };
+    let ports: Option<Vec<Port>> = graph.inputs.iter().map(port).collect();
+    ports
+        .filter(|ports| !ports.is_empty())
+        .ok_or_else(|| if graph.inputs.is_empty() { "none".to_owned() } else { described() })
 }
 
 fn description(input: &Input) -> String {

@@ -50,6 +50,15 @@ impl<'a> Value<'a> {
         }
         Ok(())
     }
+
+    /// Appends floats of 64 bits, packed or one.
+    pub fn doubles(self, numbers: &mut Vec<f64>) -> Result<(), String> {
+        match self {
+            Value::Fixed64(bytes) => numbers.push(f64::from_le_bytes(bytes)),
+            _ => numbers.extend(self.bytes()?.as_chunks().0.iter().map(|bytes| f64::from_le_bytes(*bytes))),
+        }
+        Ok(())
+    }
 }
 
 /// Returns the fields of a message, with their numbers.

@@ -3,7 +3,7 @@
 /// Most entries of an array.
 const MAX_LEN: usize = 1 << 26;
 
-/// Array of 32-bit floats or of integers, row-major.
+/// Array of floats or of integers, row-major.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Tensor {
     /// Length of each dimension.
@@ -15,9 +15,9 @@ pub struct Tensor {
 /// Entries of an array.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Data {
-    /// 32-bit floats.
+    /// Floats.
     Float(Vec<f32>),
-    /// 64-bit integers, such as shapes and indices.
+    /// Integers, such as shapes and indices; truth values are 0 and 1.
     Integer(Vec<i64>),
 }
 
@@ -34,12 +34,20 @@ impl Tensor {
         Ok(Self { shape, data: Data::Integer(values) })
     }
 
+    /// Returns the number of entries.
+    pub fn len(&self) -> usize {
+        match &self.data {
+            Data::Float(values) => values.len(),
+            Data::Integer(values) => values.len(),
+        }
+    }
+
     /// Returns the floats.
     pub fn as_floats(&self) -> Result<&[f32], String> {
         if let Data::Float(values) = &self.data {
             Ok(values)
         } else {
-            Err("integers where floats are expected".to_owned())
+            Err("has integers where floats are expected".to_owned())
         }
     }
 
@@ -48,18 +56,32 @@ impl Tensor {
         if let Data::Integer(values) = &self.data {
             Ok(values)
         } else {
-            Err("floats where integers are expected".to_owned())
+            Err("has floats where integers are expected".to_owned())
+        }
+    }
+
+    /// Returns the entries as floats.
+    pub fn to_floats(&self) -> Vec<f32> {
+        match &self.data {
+            Data::Float(values) => values.clone(),
+            Data::Integer(values) => values.iter().map(|value| *value as f32).collect(),
         }
     }
 
     /// Returns the array with another shape of as many entries.
     pub fn reshaped(&self, shape: Vec<usize>) -> Result<Self, String> {
-        let len = match &self.data {
-            Data::Float(values) => values.len(),
-            Data::Integer(values) => values.len(),
-        };
-        check_len(&shape, len)?;
+        check_len(&shape, self.len())?;
         Ok(Self { shape, data: self.data.clone() })
+    }
+
+    /// Returns an array of the same kind whose entry `i` is entry `index(i)` of this one. The indices must exist.
+    pub fn picked(&self, shape: Vec<usize>, index: impl Fn(usize) -> usize) -> Result<Self, String> {
+        let count = len(&shape)?;
+        let data = match &self.data {
+            Data::Float(values) => Data::Float((0..count).map(|entry| values[index(entry)]).collect()),
+            Data::Integer(values) => Data::Integer((0..count).map(|entry| values[index(entry)]).collect()),
+        };
+        Ok(Self { shape, data })
     }
 
     /// Returns the index of a dimension; negative ones count from the end.
@@ -79,36 +101,43 @@ impl Tensor {
 /// Returns the number of entries of a shape. Fails if it is too large.
 pub fn len(shape: &[usize]) -> Result<usize, String> {
     let product = shape.iter().try_fold(1usize, |product, len| product.checked_mul(*len));
-    product.filter(|len| *len <= MAX_LEN).ok_or_else(|| format!("an array with the dimensions {shape:?}"))
+    product.filter(|len| *len <= MAX_LEN).ok_or_else(|| format!("makes an array with the dimensions {shape:?}"))
 }
 
 fn check_len(shape: &[usize], given: usize) -> Result<(), String> {
-    if len(shape)? == given { Ok(()) } else { Err(format!("{given} entries for the dimensions {shape:?}")) }
+    if len(shape)? == given { Ok(()) } else { Err(format!("has {given} entries for the dimensions {shape:?}")) }
 }
 
-/// Returns `f` of each pair of entries, where a dimension of 1 is repeated, as in NumPy.
-pub fn broadcast(a: &Tensor, b: &Tensor, f: impl Fn(f32, f32) -> f32) -> Result<Tensor, String> {
-    let rank = a.shape.len().max(b.shape.len());
+/// Returns the shape of a result of which each dimension of 1 is repeated, as in NumPy.
+pub fn broadcast_shape(a: &[usize], b: &[usize]) -> Result<Vec<usize>, String> {
+    let rank = a.len().max(b.len());
     let padded = |shape: &[usize]| [&vec![1; rank - shape.len()], shape].concat();
-    let (shape_a, shape_b) = (padded(&a.shape), padded(&b.shape));
-    let mut shape = Vec::with_capacity(rank);
-    for (a, b) in shape_a.iter().zip(&shape_b) {
-        match (*a, *b) {
-            (a, b) if a == b || b == 1 => shape.push(a),
-            (1, b) => shape.push(b),
-            _ => return Err(format!("the dimensions {shape_a:?} and {shape_b:?} do not fit")),
-        }
+    let one = |(a, b): (usize, usize)| match (a, b) {
+        (a, b) if a == b || b == 1 => Ok(a),
+        (1, b) => Ok(b),
+        _ => Err(format!("has the dimensions {a:?} and {b:?}, which do not fit")),
+    };
+    padded(a).into_iter().zip(padded(b)).map(one).collect()
+}
+
+/// Returns the array with its dimensions of 1 repeated to a shape of [`broadcast_shape`].
+pub fn repeated(tensor: &Tensor, shape: &[usize]) -> Result<Tensor, String> {
+    if tensor.shape == shape {
+        return Ok(tensor.clone());
     }
-    let (values_a, values_b) = (a.as_floats()?, b.as_floats()?);
-    let index = |mut position: usize, own: &[usize]| {
+    let missing = shape.len().saturating_sub(tensor.shape.len());
+    let own = [&vec![1; missing], &tensor.shape[..]].concat();
+    let fits = own.len() == shape.len() && own.iter().zip(shape).all(|(own, len)| own == len || *own == 1);
+    if !fits {
+        return Err(format!("has the dimensions {:?}, which do not become {shape:?}", tensor.shape));
+    }
+    let index = |mut position: usize| {
         let (mut index, mut stride) = (0, 1);
-        for (len, own) in shape.iter().zip(own).rev() {
+        for (len, own) in shape.iter().zip(&own).rev() {
             index += if *own == 1 { 0 } else { position % len * stride };
             (position, stride) = (position / len, stride * own);
         }
         index
     };
-    let pair = |position| f(values_a[index(position, &shape_a)], values_b[index(position, &shape_b)]);
-    let values = (0..len(&shape)?).map(pair).collect();
-    Tensor::floats(shape, values)
+    tensor.picked(shape.to_vec(), index)
 }

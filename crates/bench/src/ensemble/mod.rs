@@ -42,7 +42,7 @@ fn ensemble(members: usize) -> Ensemble {
         target: NetworkTarget::default(),
         scales: Normalisers { inputs: [scale(0.2), scale(4.0)], torque: scale(8.0) },
         tau_sensor: TorqueSensor::MotorCurrent,
-        gains: vec![[control.kp, control.kd]; JOINT_NAMES.len()],
+        gains: (0..JOINT_NAMES.len()).map(|joint| [control.kp[joint], control.kd[joint]]).collect(),
         variance_scale: 1.0,
         data_hash: String::new(),
         seed: 1,

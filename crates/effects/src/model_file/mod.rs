@@ -22,7 +22,7 @@ pub use actuator_network::{ActuatorNetworkConfig, MemberSampling, NetworkMode};
 pub use error::{EffectEntryError, ModelFileError};
 pub use tree::{JointEffect, JointScope, NominalGain, TreeModelFile};
 
-use crate::nominal::{ControlTable, JointsTable, NominalRobot, is_robot_file};
+use crate::nominal::{ControlTable, JointsTable, NominalRobot, NominalRobotError, is_robot_file};
 use crate::{EffectEntry, EntryError, apply_effects};
 use actuator_network::write_actuator_network;
 use effect_table::{read_entry, write_entry};
@@ -105,6 +105,11 @@ impl ModelFile {
             Ok(_) => Ok(file),
             Err(cause) => Err(ModelFileError::Conflict { name: name.to_owned(), cause }),
         }
+    }
+
+    /// Returns the model with other gains, rates, action scale and default pose. Keys that `control` lacks keep their values.
+    pub fn with_control(&self, control: &ControlTable) -> Result<Self, NominalRobotError> {
+        Ok(Self { nominal: Arc::new(self.nominal.with_control(control)?), ..self.clone() })
     }
 
     /// Returns the nominal robot with all effects applied.

@@ -189,7 +189,7 @@ mod tests {
     fn hash_depends_on_the_gains_but_not_on_the_episode_length_or_the_critic() {
         let config = WalkConfig::default();
         let mut other_gain = go2();
-        other_gain.control.kp += 1.0;
+        other_gain.control.kp[3] += 1.0;
         let hash = task(true).spec().hash();
         assert_ne!(Walk::new(config.clone(), &other_gain, true).expect("valid").spec().hash(), hash);
         let longer = WalkConfig { max_episode_s: 30.0, ..config };

@@ -1,11 +1,11 @@
 //! Comparison of what a policy expects with what the robot has.
 
-use twinstep_model::EnvSpec;
+use twinstep_model::SpecDifference;
 
 use super::finding::{Blocks, Finding};
 
-/// What a wrong quantity does, and how it is mended, for each quantity of [`EnvSpec::hash_input`].
-const QUANTITIES: [(&str, &str, &str, &str); 9] = [
+/// What a wrong quantity does, and how it is mended, for each quantity in which a policy can differ from the robot.
+const QUANTITIES: [(&str, &str, &str, &str); 12] = [
     (
         "robot",
         "policy_robot",
@@ -34,38 +34,55 @@ const QUANTITIES: [(&str, &str, &str, &str); 9] = [
         "policy_dt",
         "policy_period",
         "the policy was trained with another period than the robot's",
-        "set `control.actuator_hz` and `control.decimation` to the policy's period",
+        "start `twinstep robot` with the policy's contract (`--contract`), or set `control.policy_hz` to its rate",
+    ),
+    (
+        "joints",
+        "policy_joint_order",
+        "the policy has other joints than the robot",
+        "give `joints` of the mapping the names of the robot's joints",
+    ),
+    (
+        "policy_hz",
+        "policy_period",
+        "the policy was trained with another period than the robot's",
+        "start `twinstep robot` with the policy's contract (`--contract`), or set `control.policy_hz` to its rate",
+    ),
+    (
+        "joint_gains",
+        "policy_joint_gains",
+        "the policy was trained with other gains of single joints",
+        "start `twinstep robot` with the policy's contract (`--contract`)",
     ),
     (
         "kp",
         "policy_kp",
         "the policy was trained with another position gain",
-        "set `control.kp` to the gain of the training",
+        "start `twinstep robot` with the policy's contract (`--contract`), or set `control.kp` to the gain of the training",
     ),
     (
         "kd",
         "policy_kd",
         "the policy was trained with another velocity gain",
-        "set `control.kd` to the gain of the training",
+        "start `twinstep robot` with the policy's contract (`--contract`), or set `control.kd` to the gain of the training",
     ),
     (
         "action_scale",
         "policy_action_scale",
         "an action of 1 is another angle for the policy than for the robot",
-        "set `control.action_scale` to that of the training",
+        "start `twinstep robot` with the policy's contract (`--contract`), or set `control.action_scale` to that of the training",
     ),
     (
         "default_pose",
         "policy_default_pose",
         "the policy's actions are relative to another pose than the robot's",
-        "set `control.default_pose` to that of the training",
+        "start `twinstep robot` with the policy's contract (`--contract`), or set `control.default_pose` to that of the training",
     ),
 ];
 
 /// Returns a finding for each quantity in which the contract of a policy differs from that of the robot.
-pub fn compare(policy: &EnvSpec, robot: &EnvSpec) -> Vec<Finding> {
-    let differences = policy.differences(robot);
-    let findings = differences.into_iter().filter_map(|difference| {
+pub fn compare(differences: &[SpecDifference]) -> Vec<Finding> {
+    let findings = differences.iter().filter_map(|difference| {
         let (_, id, what, remedy) = QUANTITIES.into_iter().find(|(name, ..)| *name == difference.quantity)?;
         let [of_policy, of_robot] = &difference.values;
         let evidence =

@@ -308,7 +308,7 @@ fn pause_of_the_loop_is_not_a_jump() {
 #[test]
 fn robot_whose_gains_are_outside_the_limits_is_rejected() {
     let mut robot = go2();
-    robot.control.kp = 200.0;
+    robot.control.kp[4] = 200.0;
     let error = SafetyMachine::new(&robot, SafetyConfig::default()).expect_err("too stiff").to_string();
     assert!(error.contains("`kp` of FL_hip is 200"), "{error}");
 }
