@@ -131,8 +131,10 @@ impl Server {
             })?;
         }
         let protected = zenoh.clone();
-        let session = twinstep_session::open(zenoh)
-            .map_err(|error| ServerError::Open { listen: config.listen.clone(), reason: error.to_string() })?;
+        let session = twinstep_session::open(zenoh).map_err(|error| ServerError::Open {
+            listen: config.listen.clone(),
+            reason: twinstep_session::reason(&error),
+        })?;
         let stop_listener =
             if is_robot { Some(start_stop_listener(&session, &config.listen, &protected, &factory)?) } else { None };
         let cores = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
@@ -302,8 +304,10 @@ fn watch_clients(session: &Session, sid: &str, lease_manager: Arc<LeaseManager>)
 /// Returns the Zenoh configuration: the user's file, overridden by the settings that Twinstep requires.
 fn zenoh_config(config: &ServerConfig, max_message: usize) -> Result<zenoh::Config, ServerError> {
     let mut zenoh = match &config.zenoh {
-        Some(path) => zenoh::Config::from_file(path)
-            .map_err(|error| ServerError::ZenohConfig { path: path.clone(), reason: error.to_string() })?,
+        Some(path) => zenoh::Config::from_file(path).map_err(|error| ServerError::ZenohConfig {
+            path: path.clone(),
+            reason: twinstep_session::reason(&error),
+        })?,
         None => zenoh::Config::default(),
     };
     check_users(config, &zenoh)?;
@@ -337,7 +341,7 @@ fn zenoh_config(config: &ServerConfig, max_message: usize) -> Result<zenoh::Conf
         zenoh.insert_json5(key, value).map_err(|error| ServerError::Setting {
             field,
             value: value.to_owned(),
-            reason: error.to_string(),
+            reason: twinstep_session::reason(&error),
         })?;
     }
     Ok(zenoh)

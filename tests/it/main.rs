@@ -26,6 +26,7 @@ mod excite;
 mod fake_robot;
 mod faults;
 mod fit;
+mod foreign;
 mod fuzz;
 mod golden_ensemble;
 mod hunt;

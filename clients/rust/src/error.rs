@@ -28,7 +28,7 @@ pub enum ClientError {
         reason: String,
     },
     /// No connection could be opened.
-    #[error("no server answers at {endpoint} after {waited_s:.1} s ({reason})\n  {}", connect_reason(*port_open))]
+    #[error("no server answers at {endpoint} after {waited_s:.1} s ({reason})\n  {}", connect_reason(*reachability))]
     NoServer {
         /// Endpoint of the server or router.
         endpoint: String,
@@ -36,8 +36,8 @@ pub enum ClientError {
         waited_s: f64,
         /// Error of Zenoh.
         reason: String,
-        /// True if a program accepts connections there.
-        port_open: bool,
+        /// How far a connection comes.
+        reachability: Reachability,
     },
     /// The connection works, but no server is visible.
     #[error(
@@ -180,15 +180,34 @@ pub enum ClientError {
 /// Value of `TWINSTEP_LOG` with which a server logs each rejected client and the reason.
 const SERVER_LOG: &str = "warn,twinstep=info,zenoh_transport=debug,zenoh::net::routing=info";
 
-fn connect_reason(port_open: bool) -> String {
-    if !port_open {
-        return "no program accepts connections there: start a server with `twinstep serve --listen ENDPOINT`, or check \
-                the address, the port and the firewall"
-            .to_owned();
-    }
-    format!(
-        "a program accepts connections there: either it is not a Zenoh server, or it rejects this client: its user, \
-         password or certificate, or tcp instead of tls; Zenoh does not report which\n  read the log of the server: \
-         `TWINSTEP_LOG={SERVER_LOG} twinstep serve --zenoh FILE`"
-    )
+/// How far a connection to an endpoint comes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Reachability {
+    /// A program accepts connections.
+    Open,
+    /// No program does.
+    Closed,
+    /// The name of the host is unknown.
+    UnknownHost,
+    /// The endpoint has no port.
+    NoPort,
+}
+
+fn connect_reason(reachability: Reachability) -> String {
+    let text = match reachability {
+        Reachability::UnknownHost => "the name of the host is unknown: check its spelling, or use its address",
+        Reachability::NoPort => "the endpoint has no port: tcp/HOST:PORT, such as tcp/127.0.0.1:7447",
+        Reachability::Closed => {
+            "no program accepts connections there: start a server with `twinstep serve --listen ENDPOINT`, or check the address, \
+             the port and the firewall"
+        }
+        Reachability::Open => {
+            return format!(
+                "a program accepts connections there: either it is not a Zenoh server, or it rejects this client: its user, \
+                 password or certificate, or tcp instead of tls; Zenoh does not report which\n  read the log of the server: \
+                 `TWINSTEP_LOG={SERVER_LOG} twinstep serve --zenoh FILE`"
+            );
+        }
+    };
+    text.to_owned()
 }

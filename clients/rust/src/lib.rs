@@ -43,7 +43,7 @@ mod stop_channel;
 
 pub use connection::Connection;
 pub use discovery::{Discovery, ServerInfo};
-pub use error::ClientError;
+pub use error::{ClientError, Reachability};
 pub use grouped_env::GroupedVecEnv;
 pub use options::ConnectOptions;
 pub use remote_collector::RemoteCollector;

@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 
 use zenoh::Session;
 
+use crate::error::Reachability;
 use crate::{ClientError, ConnectOptions};
 
 /// Pause between two attempts.
@@ -23,8 +24,8 @@ pub fn open(options: &ConnectOptions) -> Result<Session, ClientError> {
                 return Err(ClientError::NoServer {
                     endpoint: options.endpoint.clone(),
                     waited_s: since.elapsed().as_secs_f64(),
-                    reason: without_source_line(&error.to_string()),
-                    port_open: port_open(&options.endpoint),
+                    reason: twinstep_session::reason(&error),
+                    reachability: reachability(&options.endpoint),
                 });
             }
             Err(_) => std::thread::sleep(RETRY_PERIOD),
@@ -32,25 +33,28 @@ pub fn open(options: &ConnectOptions) -> Result<Session, ClientError> {
     }
 }
 
-/// Returns an error text of Zenoh without the source location at its end.
-fn without_source_line(error: &str) -> String {
-    error.split(" at /").next().unwrap_or(error).trim_end().to_owned()
-}
-
-/// Returns true if a program accepts connections at the endpoint.
+/// Returns how far a connection to the endpoint comes.
 ///
-/// Distinguishes a server that rejects this client from an absent server.
-fn port_open(endpoint: &str) -> bool {
-    let address = endpoint.split_once('/').map_or(endpoint, |(_, rest)| rest);
+/// Distinguishes a server that rejects this client from an absent server and a wrong address.
+fn reachability(endpoint: &str) -> Reachability {
+    let (protocol, address) = endpoint.split_once('/').unwrap_or(("", endpoint));
     let address = address.split(['?', '#']).next().unwrap_or_default();
-    let mut addresses = address.to_socket_addrs().into_iter().flatten();
-    addresses.any(|address| TcpStream::connect_timeout(&address, PROBE_TIMEOUT).is_ok())
+    if protocol.starts_with("unixsock") {
+        let is_open = std::os::unix::net::UnixStream::connect(address).is_ok();
+        return if is_open { Reachability::Open } else { Reachability::Closed };
+    }
+    if address.rsplit_once(':').is_none_or(|(_, port)| port.parse::<u16>().is_err()) {
+        return Reachability::NoPort;
+    }
+    let Ok(mut addresses) = address.to_socket_addrs() else { return Reachability::UnknownHost };
+    let is_open = addresses.any(|address| TcpStream::connect_timeout(&address, PROBE_TIMEOUT).is_ok());
+    if is_open { Reachability::Open } else { Reachability::Closed }
 }
 
 fn zenoh_config(options: &ConnectOptions) -> Result<zenoh::Config, ClientError> {
     let invalid = |reason: String| ClientError::Config { path: options.zenoh.clone(), reason };
     let mut config = match &options.zenoh {
-        Some(path) => zenoh::Config::from_file(path).map_err(|error| invalid(error.to_string()))?,
+        Some(path) => zenoh::Config::from_file(path).map_err(|error| invalid(twinstep_session::reason(&error)))?,
         None => zenoh::Config::default(),
     };
     let endpoints = serde_json::json!([options.endpoint]).to_string();
@@ -70,7 +74,7 @@ fn zenoh_config(options: &ConnectOptions) -> Result<zenoh::Config, ClientError> 
     ] {
         config
             .insert_json5(key, value)
-            .map_err(|error| invalid(format!("`{key}` = {value}: {}", without_source_line(&error.to_string()))))?;
+            .map_err(|error| invalid(format!("`{key}` = {value}: {}", twinstep_session::reason(&error))))?;
     }
     Ok(config)
 }

@@ -129,7 +129,8 @@ fn check_spec(policy: &EnvSpec, endpoint: &EnvSpec) -> Result<(), AgentError> {
     if differences.is_empty() {
         return Ok(());
     }
-    let hint = "serve the robot that the policy was trained on (`twinstep serve --model FILE`), or train it on this one \
-                (`twinstep train --endpoint ENDPOINT`)";
+    let hint = "for other gains, pose, scale or rate start the endpoint with the policy's contract: `--contract POLICY`, for \
+                `twinstep serve` and for `twinstep robot`; for another robot or task serve those of its training, or train it on \
+                this one (`twinstep train --endpoint ENDPOINT`)";
     Err(AgentError::Disagreement { differences, hint: hint.to_owned() })
 }

@@ -1,6 +1,6 @@
 //! `twinstep evaluate`: measures the error of a robot model on a log.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use twinstep_effects::TreeModelFile;
 use twinstep_identify::{Evaluation, evaluate, position_errors};
@@ -108,6 +108,7 @@ pub fn run(args: &Args) -> CommandResult {
         Some(file) => errors_of_tree(&file, &log, &rows)?,
         None => errors_of_quadruped(args, &log, &rows)?,
     };
+    check_finite(&evaluation, &args.log)?;
     if let Some(path) = &args.plot {
         let model = args.model.as_ref().map_or("the ideal go2".to_owned(), |model| model.display().to_string());
         let title = format!("{model} on {}", args.log.display());
@@ -137,6 +138,21 @@ fn errors_of_quadruped(args: &Args, log: &Log, rows: &[bool]) -> Result<(Evaluat
     };
     let names = JOINT_NAMES.map(str::to_owned);
     Ok((evaluation, names.into_iter().zip(errors).filter(|(_, errors)| !errors.is_empty()).collect()))
+}
+
+/// Fails if an error is not a number: the simulation diverges.
+fn check_finite(evaluation: &Evaluation, log: &Path) -> CommandResult {
+    let all =
+        (evaluation.per_joint.iter()).map(|(name, joint)| (name.as_str(), [joint.q_rmse_rad, joint.torque_rmse_nm]));
+    let is_number = |value: &Option<f64>| value.is_none_or(f64::is_finite);
+    match all.into_iter().find(|(_, values)| !values.iter().all(is_number)) {
+        Some((joint, _)) => Err(Failure::Other(miette::miette!(
+            "{}: the simulation of this model diverges at {joint}: start from a model that does not, and see `twinstep log` for what \
+             is wrong with the log",
+            log.display()
+        ))),
+        None => Ok(()),
+    }
 }
 
 /// Returns a table of the errors with one line per joint and one over all joints.

@@ -8,6 +8,7 @@ use twinstep_identify::{
     DEFAULT_EFFECTS, EffectAtScope, EffectAtScopeError, EstimateStatus, Experiment, GlobalSearch, Identification,
     IdentifyOptions, ParameterEstimate, Stage, WindowConfig, evaluate, identify,
 };
+use twinstep_logs::Log;
 
 use crate::evaluate::Rows;
 use crate::exit::{CommandResult, Failure, Signals, input, other};
@@ -156,6 +157,7 @@ pub fn write_model(args: &Args, signals: &Signals) -> CommandResult {
     let (mut experiments, mut logs) = (Vec::new(), Vec::new());
     for path in &args.logs {
         let log = open_log(path)?;
+        check_rate(&log, path, &effects)?;
         let rows = args.rows.of(&log)?;
         experiments.push(
             Experiment::new(&log, &robot, WindowConfig::IDENTIFICATION).map_err(input)?.filter_rows(|row| rows[row]),
@@ -219,6 +221,22 @@ fn check_flags_of_tree(args: &Args) -> Result<(), Failure> {
         Some((flag, _, instead)) => Err(input(FlagOfQuadrupeds { flag, instead })),
         None => Ok(()),
     }
+}
+
+/// Fails if the sensors of a log repeat, and were measured at a lower rate than an effect needs.
+fn check_rate(log: &Log, path: &Path, effects: &[(&'static Effect, Scope)]) -> CommandResult {
+    let slow: Vec<&str> =
+        effects.iter().filter(|(effect, _)| log.is_too_slow_for(effect)).map(|(effect, _)| effect.name).collect();
+    if slow.is_empty() {
+        return Ok(());
+    }
+    Err(Failure::Input(miette::miette!(
+        "{}: not identifiable from sensors that were measured at {:.0} Hz: {}\n  leave them out of `--effects`, or record the sensors at \
+         their own rate",
+        path.display(),
+        log.measured_hz().unwrap_or_default(),
+        slow.join(", ")
+    )))
 }
 
 /// Returns the effects that are requested of a quadruped, with their scopes.

@@ -59,7 +59,9 @@ pub fn learn(
     output: &DiagnosisOutput,
     progress: &mut dyn FnMut(&str) -> bool,
 ) -> Result<Option<LearnedTorque>, Failure> {
-    if output.diagnosis.unexplained.fraction < MIN_FRACTION || !output.lacks_torque {
+    // Held readings would be learned as a lag.
+    let repeats = logs.iter().any(|log| log.measured_hz().is_some());
+    if repeats || output.diagnosis.unexplained.fraction < MIN_FRACTION || !output.lacks_torque {
         return Ok(None);
     }
     let masks: Vec<&[bool]> = output.held_out.iter().map(Vec::as_slice).collect();

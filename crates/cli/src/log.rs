@@ -4,16 +4,16 @@ use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
-use twinstep_logs::{Log, LogError, LogSummary, overwritten_file};
+use twinstep_logs::{ColumnMap, Log, LogError, LogSummary, overwritten_file};
 
 use crate::exit::{CommandResult, Failure, input, other};
 
 /// Describe a measured log, or convert it.
 ///
 /// A log is a folder with a data file and meta.json, or the data file itself: data.csv, data.csv.gz or data.parquet
-/// with meta.json in the same folder (walk.json for walk.csv). It may also be an MCAP recording of the robot's topics
-/// /lowstate and /lowcmd (also rt/lowstate and rt/lowcmd; CDR). MCAP needs no meta.json; an optional one contains the
-/// mounting of the base.
+/// with meta.json in the same folder (walk.json for walk.csv). It may also be a recording of the robot's topics /lowstate and
+/// /lowcmd, in any namespace: an MCAP file, or a folder of rosbag2 with its parts (*.mcap, *.db3). A recording needs no
+/// meta.json; an optional one contains the mounting of the base.
 ///
 /// The description has channels with units and empty cells; rate, jitter and gaps; segments; for each joint the range
 /// of position, speed and torque and the distance to its limits; falls; and for each effect of the catalogue whether it
@@ -27,6 +27,10 @@ use crate::exit::{CommandResult, Failure, input, other};
 pub struct Args {
     /// Measured log: a data file, or a folder that contains one.
     log: PathBuf,
+    /// Read columns that have other names or units, as this map says (TOML): a line `q_FL_hip = { column = "pos0", unit = "deg" }`
+    /// for each, or with a star for several, `"dq_*" = { column = "vel_*", unit = "rpm" }` (docs/logs.md).
+    #[arg(long, value_name = "FILE")]
+    map: Option<PathBuf>,
     /// Write the log to this file: *.parquet, *.csv, *.csv.gz or *.mcap, or a folder, which gets data.parquet and
     /// meta.json.
     #[arg(long, value_name = "FILE")]
@@ -65,7 +69,8 @@ struct Converted<'a> {
 
 /// Describes or converts the log.
 pub fn run(args: &Args) -> CommandResult {
-    let log = open(&args.log).map_err(input)?;
+    let map = args.map.as_ref().map_or_else(|| Ok(ColumnMap::default()), ColumnMap::read).map_err(input)?;
+    let log = open(&args.log, &map).map_err(input)?;
     let converted = args.convert.as_deref().map(|to| convert(&log, &args.log, to)).transpose()?;
     if args.json {
         let report = Report { log: &args.log, description: log.describe(), converted };
@@ -98,10 +103,13 @@ fn conversion_summary(converted: &Converted<'_>, log: &Log) -> String {
     lines.join("\n") + "\n"
 }
 
-/// Opens a measured log, or a motion file, which has no measurements.
-fn open(path: &Path) -> Result<Log, LogError> {
+/// Opens a measured log, or a motion file, which has no measurements, or a recording of states without commands.
+fn open(path: &Path, map: &ColumnMap) -> Result<Log, LogError> {
     let nothing_measured = |motion: &Log| motion.joints().iter().all(|joint| motion.q(joint).is_none());
-    Log::open(path).or_else(|error| Log::open_commands(path).ok().filter(nothing_measured).ok_or(error))
+    let nothing_commanded = |states: &Log| states.joints().iter().all(|joint| states.q_cmd(joint).is_none());
+    let motion = || Log::open_commands(path).ok().filter(nothing_measured);
+    let states = || Log::open_states(path, map).ok().filter(nothing_commanded);
+    Log::open_mapped(path, map).or_else(|error| motion().or_else(states).ok_or(error))
 }
 
 fn convert<'a>(log: &Log, from: &Path, to: &'a Path) -> Result<Converted<'a>, Failure> {

@@ -227,7 +227,8 @@ impl ResidualData {
     ///
     /// Such effects imitate others in the motion: at one kd, a wrong velocity gain is viscous friction.
     pub fn has_required_torque(&self, effect: &Effect) -> bool {
-        !effect.needs.contains(&DataRequirement::TorqueMeasured) || self.logs.iter().any(has_torque)
+        let is_fast_enough = self.logs.iter().any(|log| !log.is_too_slow_for(effect));
+        is_fast_enough && (!effect.needs.contains(&DataRequirement::TorqueMeasured) || self.logs.iter().any(has_torque))
     }
 
     /// Returns the highest rate of the logs [Hz].

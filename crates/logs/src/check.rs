@@ -18,6 +18,8 @@ pub(crate) enum LogKind {
     Measurement,
     /// Motion file: commands.
     Commands,
+    /// Recording without commands.
+    States,
 }
 
 /// Validates a table and its metadata, and creates a log from them.
@@ -39,7 +41,17 @@ pub(crate) fn assemble(mut table: Table, mut meta: Meta, meta_file: &Path, need:
 
     let t = table.take("t").unwrap_or_default();
     let channels = table.columns.into_iter().collect();
-    Ok(Log { meta, t, segment, episode, joints, channels, ignored: table.ignored, notes: table.notes })
+    Ok(Log {
+        meta,
+        t,
+        segment,
+        episode,
+        joints,
+        channels,
+        ignored: table.ignored,
+        notes: table.notes,
+        measured_hz: None,
+    })
 }
 
 /// Returns the joints in the metadata, or all with a position column (in a motion file: a command column).
@@ -69,7 +81,11 @@ fn require_columns(table: &Table, joints: &[String], need: LogKind) -> Result<()
     if table.column("t").is_none() {
         return Err(missing(table, "t"));
     }
-    let quantities: &[&str] = if need == LogKind::Commands { &["q_cmd"] } else { &["q", "q_cmd"] };
+    let quantities: &[&str] = match need {
+        LogKind::Measurement => &["q", "q_cmd"],
+        LogKind::Commands => &["q_cmd"],
+        LogKind::States => &["q"],
+    };
     for joint in joints {
         for column in quantities.iter().map(|quantity| format!("{quantity}_{joint}")) {
             if table.column(&column).is_none() {

@@ -4,11 +4,12 @@ use std::io::{self, Read, Write};
 use std::path::Path;
 
 use crate::LogError;
+use crate::column_map::ColumnMap;
 use crate::log::{ColumnCells, NamedColumn};
 use crate::table::Table;
 
 /// Reads all rows. Errors contain `file`.
-pub(crate) fn read(file: &Path, source: impl Read) -> Result<Table, LogError> {
+pub(crate) fn read(file: &Path, source: impl Read, map: &ColumnMap) -> Result<Table, LogError> {
     let failed = |error: csv::Error| LogError::Read { file: file.into(), cause: into_io(error) };
     let mut reader = csv::ReaderBuilder::new()
         // Ragged rows are reported below, with row and line.
@@ -20,7 +21,7 @@ pub(crate) fn read(file: &Path, source: impl Read) -> Result<Table, LogError> {
         .from_reader(source);
     let header = reader.byte_headers().map_err(failed)?;
     let names: Vec<_> = header.iter().map(|name| String::from_utf8_lossy(name).into_owned()).collect();
-    let (mut table, indices) = Table::from_header(file, &names)?;
+    let (mut table, indices) = Table::from_header(file, &map.names(file, &names)?)?;
 
     let mut record = csv::ByteRecord::new();
     while reader.read_byte_record(&mut record).map_err(failed)? {
@@ -43,6 +44,7 @@ pub(crate) fn read(file: &Path, source: impl Read) -> Result<Table, LogError> {
             table.columns[index].1.push(value);
         }
     }
+    map.convert(&names, &mut table);
     Ok(table)
 }
 
@@ -110,7 +112,7 @@ mod tests {
     #[test]
     fn spaces_byte_order_mark_and_windows_line_ends_are_ignored() {
         let text = "\u{feff}t , battery_V\r\n0, 28.5\r\n0.005, \r\n\r\n";
-        let table = read(Path::new("data.csv"), text.as_bytes()).expect("a table");
+        let table = read(Path::new("data.csv"), text.as_bytes(), &ColumnMap::default()).expect("a table");
         assert_eq!(table.column("t"), Some(&[0.0, 0.005][..]));
         assert_eq!(format!("{:?}", table.column("battery_V").expect("a column")), "[28.5, NaN]");
         assert_eq!(table.lines, [2, 3]);

@@ -28,6 +28,7 @@ impl Log {
             falls: falls(self),
             conclusions: Vec::new(),
             ignored: self.ignored().to_vec(),
+            problems: self.problems(),
             warnings: self.notes(&timing),
             timing,
         };

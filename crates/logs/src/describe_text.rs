@@ -30,6 +30,7 @@ impl Display for LogSummary {
             }
         }
         section(out, "identifiability", &self.conclusions, conclusion)?;
+        section(out, "problems", &self.problems, |problem| problem.text.clone())?;
         section(out, "ignored columns", &self.ignored, String::clone)?;
         section(out, "warnings", &self.warnings, String::clone)
     }

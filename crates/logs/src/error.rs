@@ -271,6 +271,22 @@ pub enum LogError {
         /// Topics of the file.
         topics: String,
     },
+    /// A bag in the format of SQLite cannot be read.
+    #[error("`{file}` is not a bag of rosbag2 in the format sqlite3: {cause}")]
+    Sqlite {
+        /// The file.
+        file: PathBuf,
+        /// Error of SQLite.
+        cause: String,
+    },
+    /// A map of columns is invalid, or does not fit the file.
+    #[error("map of columns, `{file}`: {reason}")]
+    ColumnMap {
+        /// The map, or the file.
+        file: PathBuf,
+        /// What is wrong.
+        reason: String,
+    },
     /// The messages of a topic of the robot have another type or encoding.
     #[error("`{file}`, topic `{topic}` has messages {found}, but they must be unitree_go/msg/{name} as cdr")]
     McapType {

@@ -10,6 +10,7 @@ pub(crate) enum Format {
     Csv,
     CsvGz,
     Parquet,
+    /// MCAP, or SQLite as rosbag2 writes it.
     Mcap,
 }
 
@@ -17,6 +18,8 @@ pub(crate) enum Format {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Files {
     pub data: PathBuf,
+    /// Further parts of a recording that was split.
+    pub more: Vec<PathBuf>,
     pub format: Format,
     /// Metadata file; `None` if it does not exist, or if the format contains the metadata.
     pub meta: Option<PathBuf>,
@@ -24,6 +27,8 @@ pub(crate) struct Files {
 
 const ENDINGS: [(&str, Format); 4] =
     [(".parquet", Format::Parquet), (".csv", Format::Csv), (".csv.gz", Format::CsvGz), (".mcap", Format::Mcap)];
+/// Endings of the files of a bag of rosbag2.
+const BAG_ENDINGS: [&str; 2] = ["mcap", "db3"];
 
 /// Extensions of other file formats; a path with one of them is not a folder to create.
 const FOREIGN: [&str; 14] =
@@ -32,13 +37,30 @@ const FOREIGN: [&str; 14] =
 impl Files {
     /// Finds the files of a log from its folder or its data file.
     pub fn find(path: &Path) -> Result<Files, LogError> {
+        if path.is_dir() && data_files_in(path).is_empty() {
+            let parts = bag_files_in(path);
+            let stems: std::collections::BTreeSet<String> = parts.iter().map(|part| bag_name(part)).collect();
+            if stems.len() > 1 {
+                let found = parts.iter().filter_map(|part| part.file_name()?.to_str().map(str::to_owned)).collect();
+                return Err(LogError::SeveralDataFiles { folder: path.into(), found });
+            }
+            if let Some((first, rest)) = parts.split_first() {
+                let meta = Some(path.join("meta.json")).filter(|meta| meta.is_file());
+                return Ok(Files { data: first.clone(), more: rest.to_vec(), format: Format::Mcap, meta });
+            }
+        }
         let data = if path.is_dir() { data_file_in(path)? } else { path.to_owned() };
         if !data.is_file() {
             return Err(LogError::NoData { path: path.into() });
         }
+        if data.extension().is_some_and(|end| end == "db3") {
+            let meta = ["meta.json", "data.json"].map(|name| data.with_file_name(name));
+            let meta = meta.into_iter().find(|meta| meta.is_file());
+            return Ok(Files { data, more: Vec::new(), format: Format::Mcap, meta });
+        }
         let (stem, format) = split(&data).ok_or_else(|| LogError::UnknownFormat { file: data.clone() })?;
         let meta = meta_names(stem).map(|name| data.with_file_name(name)).into_iter().find(|meta| meta.is_file());
-        Ok(Files { data, format, meta })
+        Ok(Files { data, more: Vec::new(), format, meta })
     }
 
     /// Returns the preferred path of the metadata.
@@ -54,7 +76,7 @@ impl Files {
             let [meta, _] = meta_names(stem);
             // MCAP files contain their metadata.
             let meta = (format != Format::Mcap).then(|| path.with_file_name(meta));
-            return Ok(Files { data: path.to_owned(), format, meta });
+            return Ok(Files { data: path.to_owned(), more: Vec::new(), format, meta });
         }
         let ending = path.extension().map(|ending| ending.to_string_lossy().to_lowercase());
         if ending.is_some_and(|ending| FOREIGN.contains(&ending.as_str())) && !path.is_dir() {
@@ -66,7 +88,12 @@ impl Files {
             found.push("data.parquet".to_owned());
             return Err(LogError::SeveralDataFiles { folder: path.into(), found });
         }
-        Ok(Files { data: path.join("data.parquet"), format: Format::Parquet, meta: Some(path.join("meta.json")) })
+        Ok(Files {
+            data: path.join("data.parquet"),
+            more: Vec::new(),
+            format: Format::Parquet,
+            meta: Some(path.join("meta.json")),
+        })
     }
 }
 
@@ -102,6 +129,37 @@ fn data_file_in(folder: &Path) -> Result<PathBuf, LogError> {
         [name] => Ok(folder.join(name)),
         _ => Err(LogError::SeveralDataFiles { folder: folder.into(), found }),
     }
+}
+
+/// Returns the name of a bag from that of a part: `walk` for `walk_3.mcap`.
+fn bag_name(part: &Path) -> String {
+    let stem = part.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
+    match stem.rsplit_once('_') {
+        Some((name, number)) if number.chars().all(|digit| digit.is_ascii_digit()) => name.to_owned(),
+        _ => stem,
+    }
+}
+
+/// Returns the parts of a bag of rosbag2 (`NAME_0.mcap`, `NAME_1.mcap`, ...), in their order.
+fn bag_files_in(folder: &Path) -> Vec<PathBuf> {
+    let Ok(entries) = std::fs::read_dir(folder) else { return Vec::new() };
+    let all: Vec<PathBuf> = entries.flatten().map(|entry| entry.path()).collect();
+    for ending in BAG_ENDINGS {
+        let mut parts: Vec<PathBuf> = all
+            .iter()
+            .filter(|path| path.is_file() && path.extension().is_some_and(|end| end == ending))
+            .cloned()
+            .collect();
+        let number = |path: &PathBuf| {
+            let stem = path.file_stem()?.to_str()?;
+            stem.rsplit('_').next()?.parse::<u64>().ok()
+        };
+        parts.sort_by_key(|path| (number(path), path.clone()));
+        if !parts.is_empty() {
+            return parts;
+        }
+    }
+    Vec::new()
 }
 
 fn data_files_in(folder: &Path) -> Vec<String> {

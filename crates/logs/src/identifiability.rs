@@ -13,7 +13,8 @@ pub(crate) fn conclusions(log: &Log, description: &LogSummary) -> Vec<Identifiab
     if log.joints().iter().all(|joint| log.q(joint).is_none()) {
         return Vec::new();
     }
-    let features = LogFeatures { log, description };
+    let measured_hz = log.repeats().map(|repeats| repeats.rate_hz);
+    let features = LogFeatures { log, description, measured_hz };
     CATALOGUE.iter().map(|effect| identifiability(effect, &features)).collect()
 }
 
@@ -40,6 +41,8 @@ fn identifiability(effect: &Effect, features: &LogFeatures<'_>) -> Identifiabili
 struct LogFeatures<'a> {
     log: &'a Log,
     description: &'a LogSummary,
+    /// Rate of the measurements, if sensors repeat [Hz].
+    measured_hz: Option<f64>,
 }
 
 impl LogFeatures<'_> {
@@ -86,8 +89,12 @@ impl LogFeatures<'_> {
                 need_channel(measured, "torque was measured", "torque was not measured: only motion is available")
             }
             DataRequirement::Rate(hz) => {
-                let rate = self.description.timing.rate_hz.unwrap_or(0.0);
-                let too_low = || format!("a rate of {rate:.0} Hz is too low: record at {hz} Hz or more");
+                let of_rows = self.description.timing.rate_hz.unwrap_or(0.0);
+                let rate = self.measured_hz.unwrap_or(of_rows);
+                let too_low = || match self.measured_hz {
+                    Some(rate) => format!("the sensors repeat: measured at {rate:.0} Hz; {hz} Hz or more are needed"),
+                    None => format!("a rate of {rate:.0} Hz is too low: record at {hz} Hz or more"),
+                };
                 if rate >= 0.98 * hz { Ok(format!("recorded at {rate:.0} Hz")) } else { Err(too_low()) }
             }
             DataRequirement::KdVaries => need_channel(

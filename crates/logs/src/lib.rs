@@ -32,6 +32,7 @@
 //! cells; `columns` parses the column names; `check` validates the log.
 
 mod check;
+mod column_map;
 mod columns;
 mod csv_table;
 mod describe;
@@ -51,8 +52,10 @@ mod missing_channels;
 pub mod operating_conditions;
 mod parquet_checks;
 mod parquet_table;
+mod problems;
 mod read;
 pub mod recording;
+mod repeats;
 pub mod replay;
 mod resample;
 mod statistics;
@@ -60,6 +63,7 @@ mod summary;
 mod table;
 mod write;
 
+pub use column_map::ColumnMap;
 pub use error::{CellLocation, LogError};
 pub use excitation::{Excitation, SpeedSource, TorqueSource};
 pub use falls::Fall;
@@ -68,6 +72,8 @@ pub use log::Log;
 pub use log_writer::LogWriter;
 pub use mcap_file::{McapRecorder, RecordedTopic};
 pub use meta::{Gain, Meta, Segment, TorqueSensor};
+pub use problems::Problem;
+pub use repeats::Repeats;
 pub use resample::ResampleError;
 pub use summary::{
     ChannelDescription, Identifiability, IdentifiabilityLevel, LogSummary, MissingChannel, SegmentDescription, Timing,

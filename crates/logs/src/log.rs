@@ -23,6 +23,8 @@ pub struct Log {
     pub(crate) channels: BTreeMap<String, Vec<f64>>,
     pub(crate) ignored: Vec<String>,
     pub(crate) notes: Vec<String>,
+    /// Rate of the measurements of a log without repeats [Hz].
+    pub(crate) measured_hz: Option<f64>,
 }
 
 impl Log {

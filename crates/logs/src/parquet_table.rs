@@ -16,27 +16,29 @@ use parquet::file::writer::SerializedFileWriter;
 use parquet::schema::types::{ColumnDescriptor, Type};
 
 use crate::LogError;
+use crate::column_map::ColumnMap;
 use crate::columns::Column;
 use crate::log::{ColumnCells, NamedColumn};
 use crate::parquet_checks::{CheckedFile, CheckedPages};
 use crate::table::Table;
 
 /// Reads all row groups.
-pub(crate) fn read(file: &Path) -> Result<Table, LogError> {
+pub(crate) fn read(file: &Path, map: &ColumnMap) -> Result<Table, LogError> {
     // The Parquet library panics on some damaged files: negative offsets, dictionary indices without a dictionary,
     // pages that are shorter than their number of values.
-    catch_unwind(|| read_row_groups(file)).unwrap_or_else(|_| {
+    catch_unwind(|| read_row_groups(file, map)).unwrap_or_else(|_| {
         let cause = ParquetError::General("its metadata and its pages contradict each other".to_owned());
         Err(LogError::Parquet { file: file.into(), cause })
     })
 }
 
-fn read_row_groups(file: &Path) -> Result<Table, LogError> {
+fn read_row_groups(file: &Path, map: &ColumnMap) -> Result<Table, LogError> {
     let failed = |cause| LogError::Parquet { file: file.into(), cause };
     let opened = File::open(file).map_err(|cause| LogError::Read { file: file.into(), cause })?;
     let reader = SerializedFileReader::new(CheckedFile(opened)).map_err(failed)?;
     let leaves = reader.metadata().file_metadata().schema_descr().columns();
-    let (mut table, indices) = Table::from_header(file, &column_names(file, leaves)?)?;
+    let header = column_names(file, leaves)?;
+    let (mut table, indices) = Table::from_header(file, &map.names(file, &header)?)?;
 
     for (leaf, (descriptor, index)) in leaves.iter().zip(&indices).enumerate() {
         let Some(index) = *index else { continue };
@@ -50,6 +52,7 @@ fn read_row_groups(file: &Path) -> Result<Table, LogError> {
             table.columns[index].1.extend(cells.map_err(failed)?);
         }
     }
+    map.convert(&header, &mut table);
     Ok(table)
 }
 

@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use crate::check::{self, LogKind};
+use crate::column_map::ColumnMap;
 use crate::files::{Files, Format};
 use crate::limited::Limited;
 use crate::meta::KEYS;
@@ -12,18 +13,28 @@ use crate::{Log, LogError, Meta, csv_table, mcap_file, parquet_table};
 impl Log {
     /// Reads a log from its folder or its data file.
     ///
-    /// A folder contains `meta.json` and one of `data.parquet`, `data.csv`, `data.csv.gz` and `data.mcap`. The metadata
+    /// A folder is a bag of rosbag2 (`*.mcap`, `*.db3`), or contains `meta.json` and one of `data.parquet`, `data.csv`, `data.csv.gz` and `data.mcap`. The metadata
     /// of a data file `walk.csv` is `walk.json` or `meta.json` in the same folder. MCAP needs no metadata file: a file
     /// that [`Log::write`] wrote contains its metadata, and for other recordings default metadata are used.
     pub fn open(path: impl AsRef<Path>) -> Result<Log, LogError> {
-        read(path.as_ref(), LogKind::Measurement)
+        read(path.as_ref(), LogKind::Measurement, &ColumnMap::default())
+    }
+
+    /// Reads a log whose columns have other names or units, as the map says.
+    pub fn open_mapped(path: impl AsRef<Path>, map: &ColumnMap) -> Result<Log, LogError> {
+        read(path.as_ref(), LogKind::Measurement, map)
+    }
+
+    /// Reads a recording that may lack commands, to describe it. Nothing can be simulated from it.
+    pub fn open_states(path: impl AsRef<Path>, map: &ColumnMap) -> Result<Log, LogError> {
+        read(path.as_ref(), LogKind::States, map)
     }
 
     /// Reads a motion file: a log that needs only command columns, and no gains.
     ///
     /// A measured log is also a valid motion file.
     pub fn open_commands(path: impl AsRef<Path>) -> Result<Log, LogError> {
-        read(path.as_ref(), LogKind::Commands)
+        read(path.as_ref(), LogKind::Commands, &ColumnMap::default())
     }
 
     /// Creates a log from columns in memory, validated like a file. A missing cell is NaN.
@@ -37,11 +48,11 @@ impl Log {
     }
 }
 
-fn read(path: &Path, need: LogKind) -> Result<Log, LogError> {
+fn read(path: &Path, need: LogKind, map: &ColumnMap) -> Result<Log, LogError> {
     let files = Files::find(path)?;
     let (meta, unknown) = match files.meta.as_deref().map(Meta::read).transpose()? {
         Some((meta, unknown)) => (Some(meta), unknown),
-        None => (None, Vec::new()),
+        None => (map.meta(), Vec::new()),
     };
     let meta_file = files.meta.as_ref().unwrap_or(&files.data);
     let needed = |meta: Option<Meta>| {
@@ -49,16 +60,19 @@ fn read(path: &Path, need: LogKind) -> Result<Log, LogError> {
     };
     let open = || std::fs::File::open(&files.data).map_err(|cause| LogError::Read { file: files.data.clone(), cause });
     let (mut table, meta) = match files.format {
-        Format::Csv => (csv_table::read(&files.data, open()?)?, needed(meta)?),
+        Format::Csv => (csv_table::read(&files.data, open()?, map)?, needed(meta)?),
         Format::CsvGz => {
             let file = open()?;
             let length = file.metadata().map_err(|cause| LogError::Read { file: files.data.clone(), cause })?.len();
             let limit = mcap_file::length_limit(length) as u64;
             let content = Limited::new(flate2::read::MultiGzDecoder::new(file), limit);
-            (csv_table::read(&files.data, content)?, needed(meta)?)
+            (csv_table::read(&files.data, content, map)?, needed(meta)?)
         }
-        Format::Parquet => (parquet_table::read(&files.data)?, needed(meta)?),
-        Format::Mcap => mcap_file::read(&files.data, meta)?,
+        Format::Parquet => (parquet_table::read(&files.data, map)?, needed(meta)?),
+        Format::Mcap => {
+            let parts = [std::slice::from_ref(&files.data), &files.more].concat();
+            mcap_file::read(&parts, meta, need != LogKind::States)?
+        }
     };
     table.notes.extend(
         unknown.iter().map(|key| {

@@ -5,6 +5,7 @@ use twinstep_model::BaseMount;
 
 use crate::excitation::Excitation;
 use crate::falls::Fall;
+use crate::problems::Problem;
 
 /// Summary of a log, as text (`Display`) or data (`Serialize`).
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -29,6 +30,8 @@ pub struct LogSummary {
     pub conclusions: Vec<Identifiability>,
     /// Ignored columns of the file.
     pub ignored: Vec<String>,
+    /// What is wrong with the measurements.
+    pub problems: Vec<Problem>,
     /// Warnings about the log.
     #[serde(rename = "notes")]
     pub warnings: Vec<String>,

@@ -10,7 +10,7 @@ use twinstep_ensemble::{ActuatorNetworkRobot, Checkpoint, Ensemble, Inference};
 use twinstep_env_server::{Config, ConfigFileError, SimEnvFactory};
 use twinstep_excite::CommandSequence;
 use twinstep_identify::{EffectAtScope, GlobalSearch};
-use twinstep_logs::{Log, LogError};
+use twinstep_logs::{ColumnMap, Log, LogError};
 use twinstep_model::{BaseMount, Joint, MjcfOptions, go2, mjcf, stream};
 use twinstep_protocol::{Secret, keys};
 use twinstep_robot_files::{QuadrupedNames, RobotFileError, TreeMjcf, quadruped, read_robot, write_mjcf};
@@ -39,6 +39,7 @@ pub fn text_examples(format: Format) -> Vec<Vec<u8>> {
             vec![default.into_bytes(), CONFIG.into(), JUMP_CONFIG.into()]
         }
         Format::Commands => vec![COMMANDS.into()],
+        Format::ColumnMap => vec![COLUMN_MAP.into()],
         Format::Search => vec![SEARCH.into()],
         Format::Zenoh => examples_in("examples/security", "", ".json5"),
         _ => ARGUMENTS.iter().map(|text| text.as_bytes().to_vec()).collect(),
@@ -47,6 +48,18 @@ pub fn text_examples(format: Format) -> Vec<Vec<u8>> {
 
 /// Velocity commands of a run.
 const COMMANDS: &str = "start_s,end_s,vx,vy,wz\n0,5,1,0,-0.5\n5,10,-0.25,0.5,1\n10,12.5,0,0,0\n";
+
+/// Map of columns with every kind of entry.
+const COLUMN_MAP: &str = r#"
+t = { column = "stamp", unit = "ns" }
+"q_*" = { column = "pos_*", unit = "deg" }
+q_FL_calf = "knee"
+"dq_*" = { scale = -1.0, offset = 0.5 }
+[meta]
+rate_hz = 500
+tau_sensor = "none"
+segments = [{ name = "walk", base = "floating" }]
+"#;
 
 /// Config file of another task.
 const JUMP_CONFIG: &str = r#"
@@ -145,6 +158,9 @@ pub fn read(format: Format, bytes: &[u8], folder: &Path) -> Outcome {
         Format::Training => {
             outcome(Checkpoint::read(&write(folder, "training", bytes)), |checkpoint| checkpoint.curves().count() > 0)
         }
+        Format::Bag => read_log(bytes, "bag.db3", folder),
+        Format::PolicyConfig => policies::read(format, bytes, &write(folder, "deploy.yaml", bytes)),
+        Format::PolicyConfigPy => policies::read(format, bytes, &write(folder, "go2_config.py", bytes)),
         Format::Policy | Format::Onnx | Format::Mapping | Format::LowState | Format::RpcResponse => {
             policies::read(format, bytes, &write(folder, "policy", bytes))
         }
@@ -173,6 +189,7 @@ fn outcome<T, E: std::fmt::Display>(result: Result<T, E>, is_accepted: impl FnOn
 
 fn read_text(format: Format, text: &str, folder: &Path) -> Outcome {
     match format {
+        Format::ColumnMap => outcome(ColumnMap::parse(text), |_| true),
         Format::Model => {
             copy_robots(folder);
             read_model(&write(folder, "model.toml", text.as_bytes()), text)

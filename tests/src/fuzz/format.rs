@@ -99,6 +99,14 @@ pub enum Format {
     Onnx,
     /// Mapping of a foreign policy (TOML).
     Mapping,
+    /// Config of the training of a foreign policy (YAML).
+    PolicyConfig,
+    /// Config of legged_gym (Python).
+    PolicyConfigPy,
+    /// Map of the columns of a log (TOML).
+    ColumnMap,
+    /// Recording of rosbag2 in the format of SQLite.
+    Bag,
     /// State of the robot, as its DDS topic has it (CDR).
     LowState,
     /// Response of a service of the robot (CDR).
@@ -110,7 +118,7 @@ pub enum Format {
 }
 
 /// Formats of files, with their names.
-const FILES: [(Format, &str); 20] = [
+const FILES: [(Format, &str); 24] = [
     (Format::Model, "model_file"),
     (Format::Urdf, "robot_urdf"),
     (Format::Mjcf, "robot_mjcf"),
@@ -127,6 +135,10 @@ const FILES: [(Format, &str); 20] = [
     (Format::Policy, "policy"),
     (Format::Onnx, "policy_onnx"),
     (Format::Mapping, "policy_mapping"),
+    (Format::PolicyConfig, "policy_config"),
+    (Format::PolicyConfigPy, "policy_config_py"),
+    (Format::ColumnMap, "log_map"),
+    (Format::Bag, "log_db3"),
     (Format::LowState, "robot_low_state"),
     (Format::RpcResponse, "robot_rpc_response"),
     (Format::Zenoh, "zenoh_config"),
@@ -176,8 +188,27 @@ impl Format {
 
     /// Returns true if changes to words and lines are useful.
     pub fn is_text(self) -> bool {
-        use Format::{Argument, Commands, Config, Csv, Mapping, Meta, Mjcf, Model, Search, Urdf, Zenoh};
-        matches!(self, Model | Urdf | Mjcf | Config | Csv | Commands | Mapping | Meta | Search | Zenoh | Argument)
+        use Format::{
+            Argument, ColumnMap, Commands, Config, Csv, Mapping, Meta, Mjcf, Model, PolicyConfig, PolicyConfigPy,
+            Search, Urdf, Zenoh,
+        };
+        matches!(
+            self,
+            Model
+                | Urdf
+                | Mjcf
+                | Config
+                | Csv
+                | Commands
+                | Mapping
+                | Meta
+                | Search
+                | Zenoh
+                | Argument
+                | PolicyConfig
+                | PolicyConfigPy
+                | ColumnMap
+        )
     }
 
     /// Returns the maximum memory that reading an input may need.
@@ -188,6 +219,8 @@ impl Format {
             Format::Wire(_) => MemoryLimit { constant: MIB + (64 << 10), factor: 64 },
             // The Parquet library reserves, but does not touch, the length that a page claims: up to 2 GiB.
             Format::Parquet => MemoryLimit { constant: 2052 * MIB, factor: 256 },
+            // An operation may compute 4 million numbers, and a network 16 million.
+            Format::Onnx => MemoryLimit { constant: 160 * MIB, factor: 256 },
             // A chunk may have 16 MiB, or 1024 times the length of a compressed file.
             Format::Mcap => MemoryLimit { constant: 20 * MIB, factor: 1280 },
             _ => MemoryLimit { constant: 4 * MIB, factor: 256 },

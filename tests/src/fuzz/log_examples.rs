@@ -4,6 +4,7 @@ use std::sync::LazyLock;
 
 use twinstep_logs::{Log, Meta, Segment, TorqueSensor};
 use twinstep_model::BaseMount;
+use twinstep_unitree::{LowCmd, LowState, encode};
 
 /// Number of rows.
 const ROWS: usize = 8;
@@ -142,4 +143,25 @@ fn cdr_body(size: usize, row: u64) -> Vec<u8> {
         body[24..40].copy_from_slice(&[1.0f32, 0.0, 0.0, 0.0].map(f32::to_le_bytes).concat());
     }
     [vec![0, 1, 0, 0], body].concat()
+}
+
+/// Returns a bag of rosbag2 in the format of SQLite, with a state and a command.
+pub fn bag() -> Vec<u8> {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let path = folder.path().join("bag.db3");
+    let bag = rusqlite::Connection::open(&path).expect("a file");
+    bag.execute_batch(
+        "PRAGMA page_size = 512;
+         CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT, offered_qos_profiles TEXT);
+         CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB);
+         INSERT INTO topics VALUES (1, '/lowstate', 'unitree_go/msg/LowState', 'cdr', ''), (2, '/lowcmd', 'unitree_go/msg/LowCmd',
+             'cdr', '');",
+    )
+    .expect("tables");
+    let messages = [(2, 1_000_000, encode(&LowCmd::default())), (1, 2_000_000, encode(&LowState::default()))];
+    for message in messages {
+        bag.execute("INSERT INTO messages (topic_id, timestamp, data) VALUES (?1, ?2, ?3)", message).expect("a row");
+    }
+    drop(bag);
+    std::fs::read(&path).expect("the file")
 }

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use twinstep_agent::{Mapping, OnnxNetwork};
+use twinstep_agent::{Mapping, OnnxNetwork, import_policy};
 use twinstep_envs::base_spec;
 use twinstep_model::go2;
 use twinstep_policy::{Mlp, Normaliser, Policy, PolicyOrigin, PolicyRunner};
@@ -18,8 +18,10 @@ const HIDDEN: usize = 2;
 pub fn examples(format: Format) -> Vec<Vec<u8>> {
     match format {
         Format::Policy => vec![written("policy.safetensors")],
-        Format::Onnx => vec![written("policy.onnx")],
+        Format::Onnx => [vec![written("policy.onnx")], examples_in("crates/agent/golden", "", "_script.onnx")].concat(),
         Format::Mapping => examples_in("data/policies/mappings", "", ".toml"),
+        Format::PolicyConfig => [DEPLOY_YAML, ENV_YAML, RL_SAR_YAML].map(|text| text.as_bytes().to_vec()).to_vec(),
+        Format::PolicyConfigPy => vec![LEGGED_GYM.into()],
         Format::LowState => vec![encode(&upright().with_checksum())],
         _ => vec![encode(&RpcResponse { id: 7, api_id: 1001, data: SERVICE.to_owned(), ..RpcResponse::default() })],
     }
@@ -27,6 +29,60 @@ pub fn examples(format: Format) -> Vec<Vec<u8>> {
 
 /// Answer of the service that says which controller is active.
 const SERVICE: &str = r#"{"form":"0","name":"mcf"}"#;
+
+/// Configs in the form of each program.
+const DEPLOY_YAML: &str = "joint_ids_map: [3, 0, 9, 6, 4, 1, 10, 7, 5, 2, 11, 8]
+step_dt: 0.02
+stiffness: [30, 31, 32, 25, 25, 25, 25, 25, 25, 25, 25, 25]
+damping: [0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5]
+default_joint_pos: [0.1, -0.1, 0.1, -0.1, 0.8, 0.8, 1.0, 1.0, -1.5, -1.5, -1.5, -1.5]
+actions: {JointPositionAction: {clip: null, scale: 0.25}}
+observations:
+  base_ang_vel: {params: {}, clip: [-100, 100], scale: [0.2, 0.2, 0.2], history_length: 5}
+  gait_phase: {params: {period: 0.6}, clip: null, scale: [1.0, 1.0], history_length: 5}
+";
+const ENV_YAML: &str = "sim: {dt: 0.005}
+decimation: 4
+scene:
+  robot:
+    init_state:
+      joint_pos: &pose {'.*L_hip_joint': 0.1, '.*R_hip_joint': -0.1, '.*_thigh_joint': 0.8, '.*_calf_joint': -1.5}
+    actuators:
+      legs: {joint_names_expr: ['.*'], stiffness: {'.*_hip_.*': 25.0, '^(?!.*_hip_joint).*': 40.0}, damping: 0.5}
+actions:
+  joint_pos: {class_type: 'x:JointPositionAction', joint_names: ['.*'], scale: 0.25}
+observations:
+  policy:
+    history_length: 2
+    base_ang_vel: {func: 'mdp:base_ang_vel', scale: 0.2, clip: !!python/tuple [-100.0, 100.0], history_length: 0}
+    actions: {func: 'mdp:last_action', scale: null, history_length: 3}
+reset: *pose
+";
+const RL_SAR_YAML: &str = "go2/himloco:
+  observations: [commands, ang_vel, dof_pos, actions]
+  observations_history: [0, 1, 2]
+  clip_actions_lower: [-100, -100]
+  clip_actions_upper: [100, 100]
+  rl_kp: [40, 41, 42]
+  rl_kd: [1, 1, 1]
+  action_scale: [0.125, 0.25, 0.25]
+  commands_scale: [2.0, 2.0, 0.25]
+  default_dof_pos: [0.1, 0.8, -1.5]
+  joint_names: [FL_hip_joint, FL_thigh_joint, FL_calf_joint]
+  dt: 0.005
+  decimation: 4
+";
+const LEGGED_GYM: &str = "class Go2Cfg(LeggedRobotCfg):
+    class env(LeggedRobotCfg.env):
+        num_observations = 48
+    class init_state(LeggedRobotCfg.init_state):
+        default_joint_angles = {'FL_hip_joint': 0.1, 'RL_hip_joint': 0.1, 'FR_hip_joint': -0.1,  # [rad]
+            'RR_hip_joint': -0.1, 'thigh': 0.8, 'calf_joint': -1.5}
+    class control(LeggedRobotCfg.control):
+        stiffness = {'joint': 20.}
+        damping = {'joint': 0.5}
+        action_scale = 0.25
+";
 
 fn written(name: &str) -> Vec<u8> {
     let spec = base_spec("walk", &go2(), vec!["alive".to_owned()], 20.0);
@@ -52,6 +108,13 @@ fn upright() -> LowState {
 pub fn read(format: Format, bytes: &[u8], path: &Path) -> Outcome {
     match format {
         Format::Policy => read_policy(path),
+        Format::PolicyConfig | Format::PolicyConfigPy => match import_policy(&[path]) {
+            Ok(imported) => Outcome::checked(Mapping::parse(&imported.mapping).is_ok()),
+            Err(error) => {
+                assert!(!error.to_string().is_empty(), "an error has a text");
+                Outcome::Refused
+            }
+        },
         Format::Onnx => read_onnx(path),
         Format::Mapping => match std::str::from_utf8(bytes).map(|text| (text, Mapping::parse(text))) {
             Ok((_, Ok(mapping))) => Outcome::checked(mapping.input_len() > 0),

@@ -20,9 +20,14 @@ impl Format {
             Format::Meta => vec![log_examples::meta().into_bytes()],
             Format::Ensemble => vec![weights_examples::ensemble()],
             Format::Training => vec![weights_examples::training()],
-            Format::Policy | Format::Onnx | Format::Mapping | Format::LowState | Format::RpcResponse => {
-                policies::examples(self)
-            }
+            Format::Bag => vec![log_examples::bag()],
+            Format::Policy
+            | Format::Onnx
+            | Format::Mapping
+            | Format::PolicyConfig
+            | Format::PolicyConfigPy
+            | Format::LowState
+            | Format::RpcResponse => policies::examples(self),
             text => files::text_examples(text),
         }
     }

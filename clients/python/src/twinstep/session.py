@@ -136,13 +136,17 @@ def check_process() -> None:
         raise ForkedProcessError(
             "this process was forked from one with a Twinstep environment, and Zenoh does not work in it\n"
             "  start processes with `spawn`: multiprocessing.get_context('spawn'), or with Gymnasium\n"
-            "  make_vec(..., vectorization_mode='async', vector_kwargs={'context': 'spawn'})"
+            "  make_vec(..., vectorization_mode='async', vector_kwargs={'context': 'spawn'})\n"
+            "  a spawned process has not imported twinstep: its environments are made with the prefix of the package,\n"
+            "  gymnasium.make('twinstep:twinstep/Go2-Walk-v0')"
         )
 
 
 def connect_error(endpoint: str, waited_s: float) -> Error:
     """Return the error of a client that could not connect; it depends on whether the port is open."""
-    if _port_open(endpoint):
+    if (problem := _address_problem(endpoint)) is not None:
+        reason = problem
+    elif _port_open(endpoint):
         reason = (
             "a program accepts connections there: either it is not a Twinstep server, or it rejects this client's "
             "user, password or certificate; read the server's log"
@@ -180,6 +184,21 @@ def _open_session(config: zenoh.Config, endpoint: str, since: float) -> zenoh.Se
         return zenoh.open(config)
     except zenoh.ZError as error:
         raise connect_error(endpoint, time.monotonic() - since) from error
+
+
+def _address_problem(endpoint: str) -> str | None:
+    """Return what is wrong with the address of an endpoint, if anything."""
+    protocol, _, address = endpoint.partition("/")
+    host, _, port = address.partition("?")[0].partition("#")[0].rpartition(":")
+    if protocol.startswith("unixsock"):
+        return None
+    if not host or not port.isdigit():
+        return "the endpoint has no port: tcp/HOST:PORT, such as tcp/127.0.0.1:7447"
+    try:
+        socket.getaddrinfo(host.strip("[]"), int(port))
+    except (OSError, OverflowError):
+        return "the name of the host is unknown: check its spelling, or use its address"
+    return None
 
 
 def _port_open(endpoint: str) -> bool:

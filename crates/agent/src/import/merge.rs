@@ -220,9 +220,13 @@ impl Draft {
             } else if one > 0 && port.len() % one == 0 {
                 let length = port.len() / one;
                 self.notes.push(format!(
-                    "the sources do not say what the input `{}` is: the last {length} observations are taken, one step after the other, \
-                     the oldest first; compare it with the program that trained it",
-                    port.name
+                    "the sources do not say what the input `{}` is: {} taken; compare it with the program that trained it",
+                    port.name,
+                    if length == 1 {
+                        "the present observation is".to_owned()
+                    } else {
+                        format!("the last {length} observations are, one step after the other, the oldest first,")
+                    }
                 ));
                 let history = (length > 1).then_some(History {
                     length,

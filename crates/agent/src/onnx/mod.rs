@@ -23,7 +23,7 @@ use tensor::{Tensor, len};
 /// Most entries of an input.
 const MAX_INPUT: usize = 1 << 20;
 /// Maximum number of entries of all arrays that an evaluation computes.
-const MAX_ENTRIES: usize = 1 << 26;
+const MAX_ENTRIES: usize = 1 << 24;
 
 /// Network of an ONNX file.
 #[derive(Clone, Debug)]

@@ -1,7 +1,7 @@
 //! Arrays of an ONNX graph.
 
-/// Most entries of an array.
-const MAX_LEN: usize = 1 << 26;
+/// Most entries of an array that an operation computes. Weights may be larger: they are in the file.
+const MAX_LEN: usize = 1 << 22;
 
 /// Array of floats or of integers, row-major.
 #[derive(Clone, Debug, PartialEq)]
@@ -105,7 +105,11 @@ pub fn len(shape: &[usize]) -> Result<usize, String> {
 }
 
 fn check_len(shape: &[usize], given: usize) -> Result<(), String> {
-    if len(shape)? == given { Ok(()) } else { Err(format!("has {given} entries for the dimensions {shape:?}")) }
+    if shape.iter().try_fold(1usize, |product, len| product.checked_mul(*len)) == Some(given) {
+        Ok(())
+    } else {
+        Err(format!("has {given} entries for the dimensions {shape:?}"))
+    }
 }
 
 /// Returns the shape of a result of which each dimension of 1 is repeated, as in NumPy.

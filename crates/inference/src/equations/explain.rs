@@ -87,7 +87,7 @@ pub fn explain(
     if is_free && !(hangs && system.balance.stands()) {
         return None;
     }
-    let laws = laws();
+    let laws: Vec<_> = laws().into_iter().filter(|law| !log.is_too_slow_for(law.effect)).collect();
     let found = Search::new(&system, &laws, scopes(), robot.clone()).run(go_on)?;
     Some(explained(found, &laws, &robot))
 }

@@ -1,10 +1,11 @@
-//! Logs as MCAP: reading and writing the robot's `/lowstate` and `/lowcmd`, one row per state.
+//! Logs as MCAP, or as rosbag2 writes them: reading and writing the robot's `/lowstate` and `/lowcmd`, one row per state.
 //!
 //! - [`messages`]: the messages of a file, and the metadata of a file that `Log::write` wrote.
 //! - [`lengths`]: limits of the lengths in a file.
 //! - [`rows`]: each state with the command in force.
 //! - [`columns`]: the columns of these rows; [`base_state`]: those of the base; [`clock`]: times by the sender's clock.
 //! - [`mod@read`], [`mod@write`]: a log from a file, and a file from a log.
+//! - [`sqlite`]: the messages of a bag in the storage format `sqlite3`.
 //! - [`recorder`]: a file from the messages of a robot while they arrive.
 
 mod base_state;
@@ -15,6 +16,7 @@ mod messages;
 mod read;
 mod recorder;
 mod rows;
+mod sqlite;
 mod whole_records;
 mod write;
 

@@ -45,17 +45,13 @@ pub(crate) fn median_step(times: impl IntoIterator<Item = u64>) -> u64 {
 /// Returns for each state the index of the command in force midway between it and the next state.
 ///
 /// A controller's command arrives shortly after the state that it responds to, and is in force for most of the
-/// interval. `median` is the median time between states [ns].
-pub(crate) fn commands_in_force(
-    states: &[(u64, LowState)],
-    commands: &[(u64, LowCmd)],
-    median: u64,
-) -> Vec<Option<usize>> {
+/// interval. All times are increasing; `median` is the median time between states [ns].
+pub(crate) fn commands_in_force(states: &[u64], commands: &[u64], median: u64) -> Vec<Option<usize>> {
     let mut next = 0;
-    let in_force = |(row, (time, _)): (usize, &(u64, LowState))| {
-        let step = states.get(row + 1).map_or(median, |(later, _)| later - time);
+    let in_force = |(row, time): (usize, &u64)| {
+        let step = states.get(row + 1).map_or(median, |later| later - time);
         let middle = time + step.min(median) / 2;
-        while commands.get(next).is_some_and(|(time, _)| *time <= middle) {
+        while commands.get(next).is_some_and(|time| *time <= middle) {
             next += 1;
         }
         next.checked_sub(1)

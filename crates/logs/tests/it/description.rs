@@ -141,6 +141,8 @@ fn summary_of_a_log_with_gaps_missing_channels_and_warnings() {
           ground_friction      weak  no base position or velocity (pos, vel) was recorded; only slipping feet determine its value
           ground_stiffness     no    a rate of 100 Hz is too low: record at 200 Hz or more
           gyro_bias            no    no gyro was recorded
+        problems
+          the commands never change although the joints move: were they recorded?
         ignored columns
           note
         warnings

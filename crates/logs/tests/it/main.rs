@@ -3,10 +3,12 @@
 // `UPDATE_EXPECT` always writes snapshots with hashes.
 #![allow(clippy::needless_raw_string_hashes)]
 
+mod bags;
 mod description;
 mod errors;
 mod mcap;
 mod parquet;
+mod problems;
 mod reading;
 mod round_trip;
 
