@@ -97,7 +97,9 @@ impl MappedPolicy {
         self.state.read(&outputs);
         let mut output = std::mem::take(&mut outputs[self.action]);
         if let Some([low, high]) = self.mapping.action_clip {
-            output.iter_mut().for_each(|value| *value = value.clamp(low, high));
+            for value in &mut output {
+                *value = value.clamp(low, high);
+            }
         }
         let mut action = vec![0.0; output.len()];
         let [theirs, ours] = &self.default_pose;

@@ -4,6 +4,9 @@ use crate::error::AgentError;
 use crate::mapping::Mapping;
 use crate::onnx::{OnnxNetwork, Port};
 
+/// Index of an input that is an observation, and its name in the mapping; `None` is the one of `[[observation]]`.
+pub type Observed = (usize, Option<String>);
+
 /// The state of a recurrent network; 0 after a reset.
 #[derive(Clone, Debug, Default)]
 pub struct NetworkState(Vec<Kept>);
@@ -18,9 +21,8 @@ struct Kept {
 }
 
 impl NetworkState {
-    /// Returns the inputs that are observations, by index and name in the mapping (`None`: that of `[[observation]]`), and the
-    /// state. Fails if an input is neither.
-    pub fn of(network: &OnnxNetwork, mapping: &Mapping) -> Result<(Vec<(usize, Option<String>)>, Self), AgentError> {
+    /// Returns the inputs that are observations, and the state. Fails if an input is neither.
+    pub fn of(network: &OnnxNetwork, mapping: &Mapping) -> Result<(Vec<Observed>, Self), AgentError> {
         let (inputs, outputs) = (network.inputs(), network.outputs());
         let unknown = |name: &str, what: &'static str, ports: &[Port]| AgentError::UnknownPort {
             name: name.to_owned(),

@@ -109,7 +109,7 @@ fn input(group: &Yaml, facts: &mut Facts) -> InputFacts {
             match found.scale[..] {
                 [] => {}
                 [first, ref rest @ ..] if rest.iter().all(|scale| *scale == first) && first > 0.0 => {
-                    clip.iter_mut().for_each(|bound| *bound /= first);
+                    *clip = clip.map(|bound| bound / first);
                 }
                 _ => facts
                     .notes

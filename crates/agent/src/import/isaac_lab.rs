@@ -77,22 +77,29 @@ fn gains(robot: &Yaml, names: &[String], facts: &Facts) -> Result<(Gains, Gains)
 type Gains = Option<super::facts::Found<Vec<f64>>>;
 
 /// Returns the indices of names that one of the expressions matches as a whole.
+///
+/// Expressions are for the names in robot files, which end with `_joint`; those of some robots do not.
 fn matching(expressions: &[String], names: &[String]) -> Result<Vec<usize>, String> {
-    let compiled: Vec<Regex> = expressions.iter().map(|expression| compiled(expression)).collect::<Result<_, _>>()?;
-    Ok((0..names.len()).filter(|joint| compiled.iter().any(|one| is_match(one, &names[*joint]))).collect())
+    let mut found = Vec::new();
+    for expression in expressions {
+        let compiled = compiled(expression)?;
+        // A search that takes too long finds nothing.
+        let with_ending = |ending: &str| {
+            let matches = |joint: &usize| compiled.is_match(&format!("{}{ending}", names[*joint])).unwrap_or(false);
+            (0..names.len()).filter(matches).collect::<Vec<_>>()
+        };
+        let long = with_ending("_joint");
+        found.extend(if long.is_empty() { with_ending("") } else { long });
+    }
+    found.sort_unstable();
+    found.dedup();
+    Ok(found)
 }
 
 fn compiled(expression: &str) -> Result<Regex, String> {
     // Expressions of Python may look ahead: `^(?!.*_hip_joint).*` is every joint but the hips.
     let whole = Regex::new(&format!("^(?:{expression})$"));
     whole.map_err(|_| format!("`{expression}` is not an expression for names of joints"))
-}
-
-/// Expressions are for the names in robot files, which end with `_joint`.
-fn is_match(expression: &Regex, name: &str) -> bool {
-    // A search that takes too long finds nothing.
-    let matches = |name: &str| expression.is_match(name).unwrap_or(false);
-    matches(name) || matches(&format!("{name}_joint"))
 }
 
 /// Returns a value for each name: one number for all, or a map from expressions to numbers. `None`: a name has none.

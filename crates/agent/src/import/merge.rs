@@ -190,7 +190,7 @@ impl Draft {
             let port = &network.inputs()[0];
             let places =
                 || format!("the network reads {} numbers, the observation of the sources has {found}", port.len());
-            if one > 0 && port.len() % one == 0 && input.terms.iter().all(|term| term.history.is_none()) {
+            if one > 0 && port.len().is_multiple_of(one) && input.terms.iter().all(|term| term.history.is_none()) {
                 let steps = port.len() / one;
                 let known = input.history.unwrap_or(History {
                     length: 1,

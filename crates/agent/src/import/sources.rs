@@ -40,7 +40,7 @@ impl Sources {
                     "onnx" => networks.push(file),
                     "yaml" | "yml" => configs.push(file),
                     "py" if is_given || text(&file).is_ok_and(|text| text.contains("default_joint_angles")) => {
-                        configs.push(file)
+                        configs.push(file);
                     }
                     _ if is_given => {
                         return Err(failed(

@@ -160,7 +160,7 @@ fn scalar(text: &str, style: ScalarStyle) -> Yaml {
         "false" | "False" | "FALSE" => Yaml::Bool(false),
         // `inf` and `nan` are words, which the parser of Rust takes for numbers.
         _ if text.starts_with(|first: char| first.is_ascii_digit() || "+-.".contains(first)) => {
-            let number = text.trim_start_matches('+').parse().ok().or_else(|| match text {
+            let number = text.trim_start_matches('+').parse().ok().or(match text {
                 ".inf" | "+.inf" => Some(f64::INFINITY),
                 "-.inf" => Some(f64::NEG_INFINITY),
                 _ => None,
@@ -200,7 +200,7 @@ mod tests {
         let mut bomb = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n".to_owned();
         for level in 1..12 {
             let aliases = vec![format!("*a{}", level - 1); 10].join(", ");
-            bomb += &format!("a{level}: &a{level} [{aliases}]\n");
+            bomb = format!("{bomb}a{level}: &a{level} [{aliases}]\n");
         }
         assert!(Yaml::parse(&bomb).expect_err("too many").contains("more than"));
         assert!(Yaml::parse(&"[".repeat(10_000)).is_err());

@@ -271,7 +271,9 @@ fn count(results: &[Tensor], entries: &mut usize) -> Result<(), String> {
 
 fn mark_last_uses(operations: &mut [Operation], outputs: &[Port], places: usize) {
     let mut is_needed = vec![false; places];
-    outputs.iter().for_each(|port| is_needed[port.place] = true);
+    for port in outputs {
+        is_needed[port.place] = true;
+    }
     for operation in operations.iter_mut().rev() {
         for place in operation.inputs.iter().chain(&operation.outputs).flatten() {
             if !std::mem::replace(&mut is_needed[*place], true) {

@@ -45,7 +45,9 @@ fn log(columns: Columns) -> Log {
 fn after(start: &str, change: impl Fn(f64) -> f64) -> Vec<(String, bool)> {
     let mut columns = good();
     for (_, cells) in columns.iter_mut().filter(|(name, _)| name.starts_with(start)) {
-        cells.iter_mut().for_each(|cell| *cell = change(*cell));
+        for cell in cells.iter_mut() {
+            *cell = change(*cell);
+        }
     }
     texts(columns)
 }

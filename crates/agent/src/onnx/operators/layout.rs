@@ -264,7 +264,7 @@ fn pad(operation: &Operation) -> Result<Tensor, String> {
     let rank = x.shape.len();
     let axes = match operation.optional(3) {
         Some(axes) => axes.as_integers()?.iter().map(|axis| x.axis(*axis)).collect::<Result<_, _>>()?,
-        None => Vec::from_iter(0..rank),
+        None => (0..rank).collect::<Vec<_>>(),
     };
     if given.len() != 2 * axes.len() || !matches!(mode.as_str(), "constant" | "edge") {
         return Err(format!("has {} pads, mode `{mode}`; two for each dimension, constant or edge", given.len()));
@@ -294,7 +294,7 @@ fn pad(operation: &Operation) -> Result<Tensor, String> {
             .map_or(operation.float("value", 0.0), |value| value.to_floats().first().copied().unwrap_or(0.0));
         match &mut result.data {
             Data::Float(values) => {
-                values.iter_mut().enumerate().filter(|(entry, _)| is_outside(*entry)).for_each(|(_, one)| *one = value)
+                values.iter_mut().enumerate().filter(|(entry, _)| is_outside(*entry)).for_each(|(_, one)| *one = value);
             }
             Data::Integer(values) => {
                 values
@@ -312,14 +312,11 @@ fn split(operation: &Operation) -> Outputs {
     let x = operation.input(0)?;
     let axis = x.axis(operation.integer("axis", 0))?;
     let (own, count) = (x.shape[axis], operation.node.outputs.len().max(1));
-    let parts = match operation.integers("split", 1)? {
-        Some(parts) => lengths(&parts)?,
-        // Equal parts; the last one may be smaller.
-        None => {
-            let part = own.div_ceil(count);
-            (0..count).map(|index| part.min(own.saturating_sub(index * part))).collect()
-        }
-    };
+    // Equal parts; the last one may be smaller.
+    let part = own.div_ceil(count);
+    let equal = (0..count).map(|index| part.min(own.saturating_sub(index * part))).collect();
+    let given = operation.integers("split", 1)?.map(|parts| lengths(&parts)).transpose()?;
+    let parts: Vec<usize> = given.unwrap_or(equal);
     if parts.iter().try_fold(0usize, |sum, part| sum.checked_add(*part)) != Some(own) {
         return Err(format!("has the parts {parts:?} of a dimension of {own}"));
     }

@@ -95,7 +95,9 @@ fn gemm(operation: &Operation) -> Result<Tensor, String> {
         product(values, b.as_floats()?, [rows, inner, columns])
     };
     let (alpha, beta) = (operation.float("alpha", 1.0), operation.float("beta", 1.0));
-    result.iter_mut().for_each(|value| *value *= alpha);
+    for value in &mut result {
+        *value *= alpha;
+    }
     if let Some(c) = operation.optional(2) {
         let c = repeated(c, &[rows, columns])?;
         result.iter_mut().zip(c.as_floats()?).for_each(|(value, c)| *value += beta * c);

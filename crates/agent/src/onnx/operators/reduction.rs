@@ -22,20 +22,28 @@ pub fn evaluate(operation: &Operation) -> Option<Outputs> {
         "ArgMin" => extreme(operation, |one, other| one < other),
         "Softmax" => along(operation, |values| {
             let largest = largest(values);
-            values.iter_mut().for_each(|x| *x = (*x - largest).exp());
+            for x in values.iter_mut() {
+                *x = (*x - largest).exp();
+            }
             let sum: f32 = values.iter().sum();
-            values.iter_mut().for_each(|x| *x /= sum);
+            for x in values.iter_mut() {
+                *x /= sum;
+            }
         }),
         "LogSoftmax" => along(operation, |values| {
             let largest = largest(values);
             let sum = values.iter().map(|x| (x - largest).exp()).sum::<f32>().ln();
-            values.iter_mut().for_each(|x| *x = *x - largest - sum);
+            for x in values.iter_mut() {
+                *x = *x - largest - sum;
+            }
         }),
         "LpNormalization" => {
             let is_one = operation.integer("p", 2) == 1;
             along(operation, move |values| {
                 let norm = if is_one { values.iter().map(|x| x.abs()).sum() } else { square_sum(values).sqrt() };
-                values.iter_mut().for_each(|x| *x /= norm);
+                for x in values.iter_mut() {
+                    *x /= norm;
+                }
             })
         }
         "LayerNormalization" => return Some(layer_normalisation(operation)),
