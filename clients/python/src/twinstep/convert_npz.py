@@ -141,8 +141,8 @@ def _time(arrays: Mapping[str, npt.NDArray[Any]], rate: float | None) -> npt.NDA
         step = float(np.spacing(np.float32(time[row]))) if arrays["t"].dtype == np.float32 else 0.0
         if step > 1e-4:
             raise ConversionError(
-                f"array `t` is float32 with values near {time[row]:.0f}: its times are {step:g} s apart at best, and do "
-                f"not advance in row {row}; save it as float64, subtract its start before saving, or state --rate HZ"
+                f"array `t` is float32 with values near {time[row]:.0f}: its times are {step:g} s apart at best, and "
+                f"do not advance in row {row}; save it as float64, subtract its start before saving, or use --rate HZ"
             )
         raise ConversionError(f"array `t` does not advance in row {row}: {time[row - 1]} s, then {time[row]} s")
     return time

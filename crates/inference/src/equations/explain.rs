@@ -87,7 +87,10 @@ pub fn explain(
     if is_free && !(hangs && system.balance.stands()) {
         return None;
     }
-    let laws: Vec<_> = laws().into_iter().filter(|law| !log.is_too_slow_for(law.effect)).collect();
+    let mut laws = laws();
+    for law in &mut laws {
+        law.is_cause = !log.is_too_slow_for(law.effect);
+    }
     let found = Search::new(&system, &laws, scopes(), robot.clone()).run(go_on)?;
     Some(explained(found, &laws, &robot))
 }

@@ -28,6 +28,8 @@ pub enum Place {
 pub struct Law {
     /// The effect.
     pub effect: &'static Effect,
+    /// True if it may be named as a cause; else it is only a nuisance, because the log cannot show it.
+    pub is_cause: bool,
     /// What it changes.
     pub place: Place,
     /// Prior standard deviation of each unknown, in its unit. Zero is no effect.
@@ -61,7 +63,16 @@ const STRENGTHS: [f64; 12] = [0.03, 0.06, 0.1, 0.15, 0.22, 0.32, 0.45, 0.6, 0.8,
 
 fn law(name: &str, place: Place, units: &[f64], values: fn(&[f64], f64) -> Vec<f64>) -> Law {
     let effect = Effect::named(name).expect("an effect of the catalogue");
-    Law { effect, place, units: units.to_vec(), is_positive: false, strengths: Vec::new(), shapes: vec![0.0], values }
+    Law {
+        effect,
+        is_cause: true,
+        place,
+        units: units.to_vec(),
+        is_positive: false,
+        strengths: Vec::new(),
+        shapes: vec![0.0],
+        values,
+    }
 }
 
 /// Returns a law of one unknown that is 1 at the end of the prior range.

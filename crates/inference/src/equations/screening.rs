@@ -101,7 +101,7 @@ impl Search<'_> {
     }
 
     pub fn scopes_of<'b>(&'b self, law: &'b Law) -> impl Iterator<Item = &'b ScopeSites> {
-        self.scopes.iter().filter(move |scope| match law.effect.target {
+        self.scopes.iter().filter(|_| law.is_cause).filter(move |scope| match law.effect.target {
             Target::Joints => scope.sites.iter().all(|site| *site != Site::Base),
             Target::Supply => scope.name == "all" && scope.sites == [Site::Base],
             Target::Bodies => scope.name != "all" && scope.sites.len() == 1,
