@@ -232,6 +232,9 @@ impl Args {
         let lacking = self.residual.as_deref().map(|path| robot_model(Some(path))).transpose()?;
         let open = |path: &PathBuf| {
             let (name, mut log) = (path.display().to_string(), open_log(path)?);
+            if let Some(rate_hz) = log.measured_hz() {
+                return Err(input(SlowSensors { log: name, rate_hz }));
+            }
             if let Some(robot) = &lacking {
                 log = residual_log(&log, robot)?.ok_or_else(|| input(NoResidual { log: name.clone() }))?;
             }
@@ -268,6 +271,17 @@ impl Args {
             seed: self.seed,
         }
     }
+}
+
+/// The readings of a log repeat.
+#[derive(Debug, thiserror::Error)]
+#[error(
+    "{log}: the sensors repeat: they were measured at {rate_hz:.0} Hz, and a network would learn that they are held as a lag; record \
+     them at their own rate"
+)]
+struct SlowSensors {
+    log: String,
+    rate_hz: f64,
 }
 
 /// A log does not show which torque a model lacks.

@@ -148,6 +148,7 @@ pub fn write_model(args: &Args, signals: &Signals) -> CommandResult {
         if each { Some(of_any_tree(args.model.as_deref())?) } else { tree_model(args.model.as_deref(), &first)? };
     if let Some(file) = tree {
         check_flags_of_tree(args)?;
+        check_rate(&first, &args.logs[0], &[])?;
         let rows = args.rows.of(&first)?;
         return identify_tree::run(&file, &first, &rows, args.effects.as_deref(), &args.out, signals);
     }
@@ -225,8 +226,11 @@ fn check_flags_of_tree(args: &Args) -> Result<(), Failure> {
 
 /// Fails if the sensors of a log repeat, and were measured at a lower rate than an effect needs.
 fn check_rate(log: &Log, path: &Path, effects: &[(&'static Effect, Scope)]) -> CommandResult {
-    let slow: Vec<&str> =
+    log.check_measurements_per_period()
+        .map_err(|error| Failure::Input(miette::miette!("{}: {error}", path.display())))?;
+    let mut slow: Vec<&str> =
         effects.iter().filter(|(effect, _)| log.is_too_slow_for(effect)).map(|(effect, _)| effect.name).collect();
+    slow.dedup();
     if slow.is_empty() {
         return Ok(());
     }

@@ -112,6 +112,15 @@ enum Velocity {
     Person(VelocityInput),
 }
 
+/// What a run needs beside the robot.
+struct Prepared {
+    policy: BoundPolicy,
+    recorder: Option<Recorder>,
+    joints: Option<JointRecorder>,
+    velocity: Velocity,
+    view: Option<RunView>,
+}
+
 /// Runs the policy and prints the summary.
 pub fn run(args: &Args) -> CommandResult {
     let signals = Signals::listen()?;
@@ -148,16 +157,17 @@ pub fn record(args: &Args, signals: &Signals) -> Result<Recording, Failure> {
     let commands = args.commands.as_deref().map(read_commands).transpose()?;
     let loaded = LoadedPolicy::read(&args.policy, args.mapping.as_deref()).map_err(input)?;
     let mut env = RemoteVecEnv::connect(&args.options(signals)).map_err(|error| interrupted(signals, error))?;
-    let mut policy = loaded.bind(env.spec()).map_err(input)?;
-    if let Some(velocity) = args.velocity {
-        env.set_velocity_commands(&[velocity]).map_err(input)?;
-    }
-    let (mut recorder, mut joints) = args.recorders(&mut env, signals)?;
-    let velocity = args.velocity_source(commands)?;
-    if args.view.is_wanted() && args.log.is_none() {
-        env.reset(&ResetRequest::seeded(args.seed, 1)).map_err(|error| interrupted(signals, error))?;
-    }
-    let view = RunView::open(&args.view, &env, matches!(velocity, Velocity::Endpoint))?;
+    let Prepared { mut policy, mut recorder, mut joints, velocity, view } =
+        match args.prepared(&mut env, loaded, commands, signals) {
+            Ok(prepared) => prepared,
+            Err(failure) => {
+                if matches!(failure, Failure::Input(_)) {
+                    // Otherwise the robot is taken until the grace period has passed.
+                    let _ = env.close();
+                }
+                return Err(failure);
+            }
+        };
     let recorders = Recorders { steps: recorder.as_mut(), joints: joints.as_mut() };
     let result = args.steps(&mut env, &mut policy, recorders, (&velocity, view.as_ref()), signals);
     let device_failure = if let Velocity::Person(device) = &velocity { device.failure() } else { None };
@@ -196,6 +206,27 @@ impl Args {
             critic: true,
             ..ConnectOptions::new(self.endpoint.as_str(), 1)
         }
+    }
+
+    /// Compares the policy with the robot, and opens the log, the source of commands and the view.
+    fn prepared(
+        &self,
+        env: &mut RemoteVecEnv,
+        loaded: LoadedPolicy,
+        commands: Option<CommandSequence>,
+        signals: &Signals,
+    ) -> Result<Prepared, Failure> {
+        let policy = loaded.bind(env.spec()).map_err(input)?;
+        if let Some(velocity) = self.velocity {
+            env.set_velocity_commands(&[velocity]).map_err(input)?;
+        }
+        let (recorder, joints) = self.recorders(env, signals)?;
+        let velocity = self.velocity_source(commands)?;
+        if self.view.is_wanted() && self.log.is_none() {
+            env.reset(&ResetRequest::seeded(self.seed, 1)).map_err(|error| interrupted(signals, error))?;
+        }
+        let view = RunView::open(&self.view, env, matches!(velocity, Velocity::Endpoint))?;
+        Ok(Prepared { policy, recorder, joints, velocity, view })
     }
 
     /// Creates the log, if there is to be one.

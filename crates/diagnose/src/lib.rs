@@ -75,8 +75,8 @@ use std::collections::BTreeMap;
 
 use twinstep_effects::ModelFile;
 use twinstep_effects::{Effect, Scope};
-use twinstep_logs::Log;
 use twinstep_logs::replay::check_gains;
+use twinstep_logs::{Log, TooSlowForMotion};
 use twinstep_model::{RobotModel, Rollout};
 
 use cross_validation::{Accepted, CandidateFit, FitProblem};
@@ -117,6 +117,9 @@ pub enum DiagnoseError {
     /// The given model is not a valid robot.
     #[error(transparent)]
     Model(#[from] twinstep_effects::EntryError),
+    /// The sensors of a log are too slow for its motion.
+    #[error(transparent)]
+    TooSlowForMotion(#[from] TooSlowForMotion),
     /// `progress` returned false.
     #[error("interrupted before completion")]
     Interrupted,
@@ -152,6 +155,7 @@ pub fn diagnose(
     let mut say = |text: &str| if progress(text) { Ok(()) } else { Err(DiagnoseError::Interrupted) };
     for log in &logs {
         check_gains(log).map_err(ExperimentError::from)?;
+        log.check_measurements_per_period()?;
     }
     if let [log] = logs.as_slice()
         && let Some(output) = by_equations::diagnose_by_equations(log, model, simulator, &mut say)?

@@ -35,6 +35,7 @@ const MOST_CAUSES: usize = 12;
 pub fn diagnose_torques(logs: &[Log], progress: &mut DiagnoseProgress) -> Result<Diagnosis, DiagnoseError> {
     for log in logs {
         check_gains(log).map_err(ExperimentError::from)?;
+        log.check_measurements_per_period()?;
     }
     let mut all = Vec::new();
     for names in logs[0].joints().chunks(TOGETHER) {

@@ -73,7 +73,7 @@ pub use log_writer::LogWriter;
 pub use mcap_file::{McapRecorder, RecordedTopic};
 pub use meta::{Gain, Meta, Segment, TorqueSensor};
 pub use problems::Problem;
-pub use repeats::Repeats;
+pub use repeats::{Repeats, TooSlowForMotion};
 pub use resample::ResampleError;
 pub use summary::{
     ChannelDescription, Identifiability, IdentifiabilityLevel, LogSummary, MissingChannel, SegmentDescription, Timing,

@@ -5,6 +5,7 @@
 
 use std::ops::Range;
 
+use thiserror::Error;
 use twinstep_effects::{DataRequirement, Effect};
 use twinstep_model::Joint;
 
@@ -17,6 +18,25 @@ const AROUND: usize = 25;
 const MIN_SHARE: f64 = 0.05;
 /// Number of steps of an encoder that a slow joint does not turn from one row to the next.
 const MIN_STEPS: f64 = 3.0;
+
+/// Fewest measurements in a period of the motion, on average over its frequencies. Between fewer, accelerations and torques change so much
+/// that neither an integral over the time between two measurements nor a simulation with mean commands is right.
+const MIN_PER_PERIOD: f64 = 12.0;
+
+/// Sensors that were read too slowly for the motion.
+#[derive(Clone, Debug, PartialEq, Error)]
+#[error(
+    "the sensors were measured at {rate_hz:.1} Hz, {per_period:.1} times in a period of the motion of {joint}; below {MIN_PER_PERIOD} times \
+     the forces between two measurements are unknown: record the sensors at their own rate, or move more slowly"
+)]
+pub struct TooSlowForMotion {
+    /// Joint that moves most.
+    pub joint: String,
+    /// Rate of the measurements [Hz].
+    pub rate_hz: f64,
+    /// Measurements in a period of the motion.
+    pub per_period: f64,
+}
 
 /// Rows without a new measurement.
 #[derive(Clone, Debug, PartialEq)]
@@ -67,7 +87,7 @@ impl Log {
         Some(Repeats { is_repeated, share, rate_hz })
     }
 
-    /// Returns the log without the rows that repeat. The commands of a row are the means until the next one.
+    /// Returns the log without the rows that repeat. Commands and torques of a row are the means until the next one.
     pub fn without_repeats(&self, repeats: &Repeats) -> Self {
         let kept: Vec<usize> = (0..self.rows()).filter(|row| !repeats.is_repeated[*row]).collect();
         let end = |index: usize| {
@@ -83,9 +103,22 @@ impl Log {
             let known: Vec<f64> = part.iter().copied().filter(|cell| !cell.is_nan()).collect();
             if known.is_empty() { f64::NAN } else { known.iter().sum::<f64>() / known.len() as f64 }
         };
+        // A torque that repeats, too, is known at two times, between which it has changed.
+        let torque = |cells: &[f64], index: usize| {
+            let (first, rows) = (kept[index], kept[index]..end(index));
+            let next = kept
+                .get(index + 1)
+                .filter(|next| **next == rows.end && cells[rows.clone()].iter().all(|cell| *cell == cells[first]));
+            next.map_or_else(|| mean(cells, index), |next| 0.5 * (cells[first] + cells[*next]))
+        };
         let channels = self.channels.iter().map(|(name, cells)| {
-            let is_mean = ["q_cmd_", "dq_cmd_", "tau_ff_", "tau_measured_"].iter().any(|start| name.starts_with(start));
-            let value = |index: usize| if is_mean { mean(cells, index) } else { cells[kept[index]] };
+            let is_torque = name.starts_with("tau_measured_");
+            let is_mean = ["q_cmd_", "dq_cmd_", "tau_ff_"].iter().any(|start| name.starts_with(start));
+            let value = |index: usize| match (is_torque, is_mean) {
+                (true, _) => torque(cells, index),
+                (_, true) => mean(cells, index),
+                _ => cells[kept[index]],
+            };
             (name.clone(), (0..kept.len()).map(value).collect())
         });
         let pick = |all: &[u32]| kept.iter().map(|row| all[*row]).collect::<Vec<_>>();
@@ -106,6 +139,30 @@ impl Log {
     /// Returns the rate of the measurements, if repeats were left out of the log [Hz].
     pub fn measured_hz(&self) -> Option<f64> {
         self.measured_hz
+    }
+
+    /// Fails if repeats were left out of the log, and its joints move too fast for the rate of the measurements that are left.
+    pub fn check_measurements_per_period(&self) -> Result<(), TooSlowForMotion> {
+        let Some(rate_hz) = self.measured_hz else { return Ok(()) };
+        let differences = |of: &[f64]| of.windows(2).map(|pair| pair[1] - pair[0]).collect::<Vec<_>>();
+        let power = |of: &[f64]| of.iter().map(|one| one * one).sum::<f64>();
+        let power_of = |joint: usize| {
+            let q = self.q(&self.joints()[joint])?;
+            let parts = self.segments().map(|(_, rows)| {
+                let steps = differences(&q[rows]);
+                [power(&steps), power(&differences(&steps))]
+            });
+            let [first, second] = parts.fold([0.0; 2], |sum, part| [sum[0] + part[0], sum[1] + part[1]]);
+            Some((joint, first, second))
+        };
+        let most = (0..self.joints().len()).filter_map(power_of).max_by(|a, b| a.1.total_cmp(&b.1));
+        let Some((joint, first, second)) = most.filter(|(_, first, _)| *first > 0.0) else { return Ok(()) };
+        // A step of a sine of n measurements in a period changes by 2 sin(π / n) of its size.
+        let per_period = std::f64::consts::PI / (0.5 * (second / first).sqrt()).min(1.0).asin();
+        if per_period >= MIN_PER_PERIOD {
+            return Ok(());
+        }
+        Err(TooSlowForMotion { joint: self.joints()[joint].clone(), rate_hz, per_period })
     }
 
     /// Returns true if repeats were left out of the log, and the rate of its measurements is too low for an effect: a held reading
@@ -144,14 +201,18 @@ mod tests {
             let q = 0.3 * (std::f64::consts::TAU * hz * (row / hold * hold) as f64 / 500.0).sin();
             if step > 0.0 { (q / step).round() * step } else { q }
         };
-        let meta =
-            Meta::new(500.0, TorqueSensor::None, vec![Segment { name: "air".to_owned(), base: BaseMount::Fixed }]);
+        let meta = Meta::new(
+            500.0,
+            TorqueSensor::MotorCurrent,
+            vec![Segment { name: "air".to_owned(), base: BaseMount::Fixed }],
+        );
         let column = |of: &dyn Fn(usize) -> f64| (0..2000).map(of).collect::<Vec<_>>();
         Log::new(
             meta,
             [
                 ("t".to_owned(), column(&|row| row as f64 / 500.0)),
                 ("q_FL_hip".to_owned(), column(&position)),
+                ("tau_measured_FL_hip".to_owned(), column(&|row| 2.0 + (row / hold) as f64)),
                 ("q_cmd_FL_hip".to_owned(), column(&|row| row as f64)),
             ],
         )
@@ -171,7 +232,26 @@ mod tests {
             // The mean of ten commands that rise by 1 each.
             let first = (thin.t()[row] * 500.0).round();
             assert!((thin.q_cmd("FL_hip").expect("commands")[row] - (first + 4.5)).abs() < 1e-9);
+            // Half of what it is at both ends.
+            let torque = thin.channel("tau_measured_FL_hip").expect("torques")[row];
+            assert!((torque - (2.5 + first / 10.0)).abs() < 1e-9, "{torque}");
         }
+    }
+
+    #[test]
+    fn motion_faster_than_the_sensors_is_refused() {
+        let checked = |hz: f64, hold: usize| {
+            let log = log(hz, 0.0, hold);
+            let thin = log.repeats().map_or_else(|| log.clone(), |repeats| log.without_repeats(&repeats));
+            thin.check_measurements_per_period()
+        };
+        // 71 and 20 measurements in a period, 8 of a sensor at 50 Hz, and 8 of one that does not repeat.
+        assert_eq!(checked(0.7, 10), Ok(()));
+        assert_eq!(checked(2.5, 10), Ok(()));
+        let refused = checked(6.1, 10).expect_err("aliased");
+        assert_eq!(refused.joint, "FL_hip");
+        assert!((refused.per_period - 50.0 / 6.1).abs() < 0.3, "{}", refused.per_period);
+        assert_eq!(checked(61.0, 1), Ok(()));
     }
 
     #[test]
