@@ -10,7 +10,7 @@ fn changed_messages_and_files_are_read_or_refused_within_their_memory_limit() {
     let table = String::from_utf8_lossy(&output.stdout);
     println!("{table}{}", String::from_utf8_lossy(&output.stderr));
     assert!(output.status.success(), "an input was found");
-    assert!(table.contains("| all messages | 30000 |") && table.contains("| all files | 38200 |"));
+    assert!(table.contains("| all messages | 30000 |") && table.contains("| all files | 46200 |"));
 }
 
 #[test]

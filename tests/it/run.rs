@@ -257,11 +257,7 @@ fn policies_that_do_not_fit_are_refused_with_every_difference() {
         policy and endpoint do not agree; no action was sent
           kp: the policy has 25, the endpoint 30
           kd: the policy has 0.5, the endpoint 0.75
-          serve the robot with a model file that has
-            [control]
-            kp = 25.0
-            kd = 0.5
-            policy_hz = 50.0"#]]
+          start the endpoint with the policy's contract: `--contract MAPPING`, for `twinstep serve` and for `twinstep robot`"#]]
     .assert_eq(&refusal(&other, &simulator_spec()));
     let with_velocity = format!("{TYPES}{}{TERMS}", "[[observation]]\nterm = \"base_linear_velocity\"\n");
     expect_test::expect![[r#"
@@ -297,10 +293,10 @@ fn onnx_files_with_other_inputs_are_refused_by_name() {
     let path = folder.path().join("recurrent.onnx");
     let bytes = std::fs::read(policies().join("walk.onnx")).unwrap();
     std::fs::write(&path, with_input(&bytes, "h_in", &[1, 1, 64])).unwrap();
-    let error = OnnxNetwork::read(&path).unwrap_err().to_string().replace(&path.display().to_string(), "FILE");
+    let error = LoadedPolicy::read(&path, None).unwrap().bind(&simulator_spec()).unwrap_err().to_string();
     expect_test::expect![[r#"
-        FILE has the inputs `obs` (float [?, 45]), `h_in` (float [1, 1, 64]); one observation of 32-bit floats, [1, n] or [batch, n], is expected
-          recurrent policies with a state among their inputs are not supported"#]]
+        the network has 109 inputs; 45 are expected
+          the `spec` in its metadata does not belong to it"#]]
     .assert_eq(&error);
     std::fs::write(&path, b"nothing").unwrap();
     let error = OnnxNetwork::read(&path).unwrap_err().to_string();

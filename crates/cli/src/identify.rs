@@ -156,8 +156,9 @@ pub fn write_model(args: &Args, signals: &Signals) -> CommandResult {
     let model = analytic_model(args.model.as_deref())?;
     let robot = model.robot_model().map_err(input)?;
     let (mut experiments, mut logs) = (Vec::new(), Vec::new());
+    let mut opened = Some(first);
     for path in &args.logs {
-        let log = open_log(path)?;
+        let log = opened.take().map_or_else(|| open_log(path), Ok)?;
         check_rate(&log, path, &effects)?;
         let rows = args.rows.of(&log)?;
         experiments.push(

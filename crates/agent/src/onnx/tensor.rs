@@ -101,7 +101,8 @@ impl Tensor {
 /// Returns the number of entries of a shape. Fails if it is too large.
 pub fn len(shape: &[usize]) -> Result<usize, String> {
     let product = shape.iter().try_fold(1usize, |product, len| product.checked_mul(*len));
-    product.filter(|len| *len <= MAX_LEN).ok_or_else(|| format!("makes an array with the dimensions {shape:?}"))
+    let refused = || format!("makes an array with the dimensions {shape:?}, longer than {MAX_LEN} numbers");
+    product.filter(|len| *len <= MAX_LEN).ok_or_else(refused)
 }
 
 fn check_len(shape: &[usize], given: usize) -> Result<(), String> {

@@ -12,7 +12,7 @@ use twinstep_unitree::decode;
 
 use super::clock::sender_times;
 use super::lengths::{MAX_READ, check_texts, is_used, length_limit};
-use super::sqlite;
+use super::sqlite::{self, Entry};
 use super::{METADATA, PART_TOPIC, SegmentStart};
 use crate::go2_message::{BaseState, LowCmd, LowState};
 use crate::{LogError, Meta};
@@ -67,7 +67,12 @@ impl Recording {
         for (number, file) in files.iter().enumerate() {
             (recording.file, recording.schemas) = (number, BTreeMap::new());
             if file.extension().is_some_and(|end| end == "db3") {
-                sqlite::read(file, &mut recording)?;
+                sqlite::read(file, |entry| match entry {
+                    Entry::Topic { id, topic, kind, encoding } => {
+                        recording.open_channel(file, id, topic, (&kind, &encoding))
+                    }
+                    Entry::Message { topic, time, data } => recording.message(file, topic, time, data),
+                })?;
             } else {
                 recording.read_mcap(file)?;
             }
@@ -129,7 +134,7 @@ impl Recording {
     }
 
     /// Adds a channel. Fails if a topic of the robot has messages of another type.
-    pub fn open_channel(
+    fn open_channel(
         &mut self,
         file: &Path,
         id: u16,
@@ -162,7 +167,7 @@ impl Recording {
     }
 
     /// Adds a message of a channel.
-    pub fn message(&mut self, file: &Path, channel: u16, time: u64, data: &[u8]) -> Result<(), LogError> {
+    fn message(&mut self, file: &Path, channel: u16, time: u64, data: &[u8]) -> Result<(), LogError> {
         let Some(channel) = self.channels.get_mut(&(self.file, channel)) else { return Ok(()) };
         channel.messages += 1;
         if channel.content == Content::Other {

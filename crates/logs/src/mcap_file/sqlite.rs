@@ -6,14 +6,29 @@ use std::path::Path;
 
 use rusqlite::{Connection, OpenFlags};
 
-use super::messages::Recording;
 use crate::LogError;
 
 /// Largest message [bytes].
 const MAX_MESSAGE: i64 = 1 << 20;
 
-/// Adds the messages of a file to a recording.
-pub(super) fn read(file: &Path, recording: &mut Recording) -> Result<(), LogError> {
+/// Entry of a file.
+pub(super) enum Entry<'a> {
+    Topic {
+        id: u16,
+        topic: String,
+        kind: String,
+        encoding: String,
+    },
+    /// Time of arrival [ns].
+    Message {
+        topic: u16,
+        time: u64,
+        data: &'a [u8],
+    },
+}
+
+/// Gives all topics of a file and then its messages, in the order of arrival.
+pub(super) fn read(file: &Path, mut take: impl FnMut(Entry) -> Result<(), LogError>) -> Result<(), LogError> {
     let failed = |cause: rusqlite::Error| LogError::Sqlite { file: file.into(), cause: cause.to_string() };
     // Without the flag a file that does not exist would be made.
     let bag = Connection::open_with_flags(file, OpenFlags::SQLITE_OPEN_READ_ONLY).map_err(failed)?;
@@ -23,7 +38,7 @@ pub(super) fn read(file: &Path, recording: &mut Recording) -> Result<(), LogErro
         let (id, topic): (i64, String) = (row.get(0).map_err(failed)?, row.get(1).map_err(failed)?);
         let (kind, encoding): (String, String) = (row.get(2).map_err(failed)?, row.get(3).map_err(failed)?);
         if let Ok(id) = u16::try_from(id) {
-            recording.open_channel(file, id, topic, (&kind, &encoding))?;
+            take(Entry::Topic { id, topic, kind, encoding })?;
         }
     }
     // Longer messages are of other topics, or damage.
@@ -34,8 +49,8 @@ pub(super) fn read(file: &Path, recording: &mut Recording) -> Result<(), LogErro
     while let Some(row) = rows.next().map_err(failed)? {
         let (id, time): (i64, i64) = (row.get(0).map_err(failed)?, row.get(1).map_err(failed)?);
         let data = row.get_ref(2).map_err(failed)?;
-        if let (Ok(id), Ok(time), Ok(data)) = (u16::try_from(id), u64::try_from(time), data.as_blob()) {
-            recording.message(file, id, time, data)?;
+        if let (Ok(topic), Ok(time), Ok(data)) = (u16::try_from(id), u64::try_from(time), data.as_blob()) {
+            take(Entry::Message { topic, time, data })?;
         }
     }
     Ok(())

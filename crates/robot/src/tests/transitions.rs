@@ -310,5 +310,5 @@ fn robot_whose_gains_are_outside_the_limits_is_rejected() {
     let mut robot = go2();
     robot.control.kp[4] = 200.0;
     let error = SafetyMachine::new(&robot, SafetyConfig::default()).expect_err("too stiff").to_string();
-    assert!(error.contains("`kp` of FL_hip is 200"), "{error}");
+    assert!(error.contains("`kp` of FR_thigh is 200"), "{error}");
 }

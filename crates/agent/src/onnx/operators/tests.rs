@@ -1,3 +1,5 @@
+//! Tests of single operators, with results that are known without an evaluator.
+
 use std::collections::HashMap;
 
 use super::*;
