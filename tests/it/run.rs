@@ -262,7 +262,7 @@ fn policies_that_do_not_fit_are_refused_with_every_difference() {
     let with_velocity = format!("{TYPES}{}{TERMS}", "[[observation]]\nterm = \"base_linear_velocity\"\n");
     expect_test::expect![[r#"
         the network has 45 inputs; 48 are expected
-          the mapping has base_linear_velocity 3, velocity_command 3, base_angular_velocity 3, projected_gravity 3, joint_position 12, joint_velocity 12, previous_action 12"#]]
+          the mapping has base_linear_velocity 3, velocity_command 3, base_angular_velocity 3, projected_gravity 3, joint_position 12, joint_velocity 12, previous_action 12 for its input `obs`"#]]
     .assert_eq(&refusal(&with_velocity, &simulator_spec()));
     let in_place = format!("{TYPES}{TERMS}").replace("projected_gravity", "base_linear_velocity");
     let robot = EnvSpec { critic_observation: Vec::new(), ..simulator_spec() };

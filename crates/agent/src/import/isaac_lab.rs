@@ -3,7 +3,7 @@
 //! Joints have the order of the articulation, breadth first, unless an action names them and keeps their order. A term is
 //! clipped before it is scaled; histories are term by term, oldest first (`isaaclab/managers/observation_manager.py`).
 
-use fancy_regex::Regex;
+use fancy_regex::{Regex, RegexBuilder};
 
 use super::deploy_yaml::common_history;
 use super::facts::{BY_KIND, Facts, InputFacts, TermFacts, joint_name, term_name};
@@ -12,6 +12,10 @@ use crate::mapping::{HistoryLayout, HistoryOrder, TermName};
 
 /// Groups of observations that an actor may read, best first.
 const GROUPS: [&str; 4] = ["policy", "actor", "obs", "student"];
+
+/// Longest expression for names of joints [characters], and the largest memory of a compiled one [bytes].
+const MAX_EXPRESSION: usize = 1000;
+const MAX_COMPILED: usize = 1 << 20;
 
 /// Reads the files of a training.
 pub fn read(source: &str, env: &Yaml, agent: Option<&Yaml>) -> Result<Facts, String> {
@@ -97,8 +101,14 @@ fn matching(expressions: &[String], names: &[String]) -> Result<Vec<usize>, Stri
 }
 
 fn compiled(expression: &str) -> Result<Regex, String> {
+    if expression.len() > MAX_EXPRESSION {
+        let len = expression.len();
+        return Err(format!(
+            "an expression for names of joints has {len} characters; at most {MAX_EXPRESSION} are read"
+        ));
+    }
     // Expressions of Python may look ahead: `^(?!.*_hip_joint).*` is every joint but the hips.
-    let whole = Regex::new(&format!("^(?:{expression})$"));
+    let whole = RegexBuilder::new(&format!("^(?:{expression})$")).delegate_size_limit(MAX_COMPILED).build();
     whole.map_err(|_| format!("`{expression}` is not an expression for names of joints"))
 }
 
@@ -189,5 +199,17 @@ fn read_agent(facts: &mut Facts, agent: &Yaml) {
     if let Some(bound) = agent.get("clip_actions").and_then(Yaml::number) {
         facts.action_clip =
             Some(super::facts::Found { value: [-bound, bound], place: "agent.yaml, clip_actions".to_owned() });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::compiled;
+
+    #[test]
+    fn expressions_that_would_fill_the_memory_are_refused() {
+        assert!(compiled("^(?!.*_hip_joint).*").expect("an expression").is_match("FL_calf_joint").expect("a match"));
+        assert!(compiled(&"a".repeat(1001)).expect_err("long").contains("1001 characters"));
+        assert!(compiled("(.{1000}){1000}").is_err(), "large when it is compiled");
     }
 }
