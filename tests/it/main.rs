@@ -63,6 +63,7 @@ mod run;
 mod samples;
 mod security;
 mod sharded;
+mod slow_sensors;
 mod soak;
 mod spi_active;
 mod terrain;

@@ -11,7 +11,7 @@ use twinstep_agent::{ImportedPolicy, import_policy};
 /// config.yaml of rl_sar, the config of legged_gym or HIMLoco (*.py), or a network with metadata of mjlab (*.onnx). With the
 /// network among them, the sizes are compared too.
 ///
-/// It says for every entry where its value comes from, what it took without being told, where sources do not agree, and
+/// It says for every entry where its value comes from, what it assumed, where sources do not agree, and
 /// what it could not find. The exit code is 1 if something is missing; the mapping then has a comment in its place.
 ///
 /// Examples: `twinstep import-policy policy/velocity/v0 --out mapping.toml` and

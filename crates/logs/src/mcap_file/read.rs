@@ -155,7 +155,7 @@ fn timed_states(
     }
     note_count(notes, same, "with the same time as a later one");
     if !parts.is_empty() {
-        notes.push(format!("the robot started {} times anew: each is an episode", parts.len()));
+        notes.push(format!("the robot restarted {} times: each start begins an episode", parts.len()));
         parts.insert(0, (first, SegmentStart { segment: 0, episode: 0, t: 0.0 }));
     }
     (kept, kept_times, parts)
