@@ -173,7 +173,7 @@ pub enum AgentError {
 }
 
 /// Says how a file of PyTorch becomes one of ONNX.
-fn torch_hint(path: &std::path::Path) -> String {
+pub fn torch_hint(path: &std::path::Path) -> String {
     if !path.extension().is_some_and(|end| end == "pt" || end == "pth" || end == "jit") {
         return String::new();
     }

@@ -37,10 +37,7 @@ pub fn read(source: &str, yaml: &Yaml) -> Result<Facts, String> {
     facts.default_pose = pose.clone().map(|pose| facts.found(pose, "default_joint_pos"));
     if let Some((name, action)) = yaml.get("actions").and_then(|actions| actions.entries().first()) {
         let place = format!("actions.{name}.scale");
-        facts.action_scale = match action.get("scale") {
-            Some(Yaml::Number(scale)) => Some(facts.found(vec![*scale], &place)),
-            scale => scale.and_then(Yaml::numbers).map(|scale| facts.found(scale, &place)),
-        };
+        facts.action_scale = action.get("scale").and_then(Yaml::one_or_more).map(|scale| facts.found(scale, &place));
         let offset = action.get("offset").and_then(Yaml::numbers);
         if let (Some(offset), Some(pose)) = (offset, pose)
             && offset != pose
@@ -100,10 +97,7 @@ fn input(group: &Yaml, facts: &mut Facts) -> InputFacts {
             continue;
         };
         let mut found = TermFacts::new(quantity, name);
-        found.scale = match term.get("scale") {
-            Some(Yaml::Number(scale)) => vec![*scale],
-            scale => scale.and_then(Yaml::numbers).unwrap_or_default(),
-        };
+        found.scale = term.get("scale").and_then(Yaml::one_or_more).unwrap_or_default();
         found.clip = term.get("clip").and_then(Yaml::numbers).and_then(|clip| clip.try_into().ok());
         if let (true, Some(clip)) = (is("scale_first"), &mut found.clip) {
             match found.scale[..] {

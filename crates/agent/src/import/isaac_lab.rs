@@ -164,10 +164,7 @@ fn observation(group: &Yaml, facts: &mut Facts, names: &[String]) -> InputFacts 
             continue;
         };
         let mut found = TermFacts::new(quantity, name);
-        found.scale = match term.get("scale") {
-            Some(Yaml::Number(scale)) => vec![*scale],
-            scale => scale.and_then(Yaml::numbers).unwrap_or_default(),
-        };
+        found.scale = term.get("scale").and_then(Yaml::one_or_more).unwrap_or_default();
         found.clip = term.get("clip").and_then(Yaml::numbers).and_then(|clip| clip.try_into().ok());
         found.period = term.at(&["params", "period"]).and_then(Yaml::number);
         let steps = of_group.or_else(|| term.get("history_length").and_then(Yaml::number)).unwrap_or(0.0);

@@ -1,8 +1,8 @@
 //! Configs of legged_gym and its descendants: Python classes with constants.
 //!
 //! Only assignments of constants are read. What a file does not set has the value of `LeggedRobotCfg`, as published. A
-//! config does not contain the terms of the observation: they are those of `compute_observations` of legged_gym (48 numbers) or
-//! of HIMLoco (45), by the number of observations. Joints have the order of Isaac Gym, leg by leg.
+//! config does not contain the terms of the observation: [`ObservationOrder`] has those of each program, by their number. Joints
+//! have the order of Isaac Gym, leg by leg.
 
 use std::collections::BTreeMap;
 
@@ -68,42 +68,98 @@ pub fn read(source: &str, text: &str, inputs: Option<usize>) -> Result<Facts, St
 }
 
 fn observation(facts: &mut Facts, number: &dyn Fn(&str) -> Option<f64>, step: Option<usize>, inputs: Option<usize>) {
-    let term = |term: TermName, scale: Vec<f64>| TermFacts { scale, ..TermFacts::new(term, term.name()) };
-    let scale =
-        |key: &str| number(&format!("normalization.obs_scales.{key}")).map_or_else(Vec::new, |scale| vec![scale]);
-    let [linear, angular] = [scale("lin_vel"), scale("ang_vel")].map(|scale| scale.first().copied().unwrap_or(1.0));
-    let command = term(TermName::VelocityCommand, vec![linear, linear, angular]);
-    let gyro = term(TermName::BaseAngularVelocity, scale("ang_vel"));
-    let gravity = term(TermName::ProjectedGravity, Vec::new());
-    let end = [
-        term(TermName::JointPosition, scale("dof_pos")),
-        term(TermName::JointVelocity, scale("dof_vel")),
-        term(TermName::PreviousAction, Vec::new()),
-    ];
-    let lengths = [step, inputs];
-    let is = |one: usize| lengths.iter().flatten().any(|len| *len == one || *len > one && len % one == 0);
-    let (one, start, program) = if is(48) && !is(45) {
-        (48, vec![term(TermName::BaseLinearVelocity, scale("lin_vel")), gyro, gravity, command], "legged_gym")
-    } else if is(45) {
-        (45, vec![command, gyro, gravity], "HIMLoco")
-    } else {
+    let scale = |key: &str| number(&format!("normalization.obs_scales.{key}"));
+    let [linear, angular] = [scale("lin_vel"), scale("ang_vel")].map(|scale| scale.unwrap_or(1.0));
+    let Some(order) = ObservationOrder::of([step, inputs]) else {
         facts.notes.push(format!(
             "the config does not say what the {} numbers of the observation are; add [[observation]] from `compute_observations`",
             step.map_or_else(|| "?".to_owned(), |step| step.to_string())
         ));
         return;
     };
-    let steps = inputs.or(step).unwrap_or(one) / one;
+    let steps = inputs.or(step).unwrap_or(order.len()) / order.len();
     let input = InputFacts {
-        terms: start.into_iter().chain(end).collect(),
+        terms: order.terms(&scale, vec![linear, linear, angular]),
         unknown: Vec::new(),
         history: history(steps, HistoryLayout::Frames, HistoryOrder::NewestFirst),
     };
+    let frames = if steps == 1 { String::new() } else { format!(", {steps} steps, the present one first") };
     facts.notes.push(format!(
-        "the config does not contain the order of the observation: that of {program} is taken, with {steps} steps, the present one \
-         first; compare it with `compute_observations`"
+        "the config does not contain the order of the observation: {}{frames} is taken; compare it with `compute_observations`",
+        order.description()
     ));
     facts.observation = Some(facts.found(input, "number of observations"));
+}
+
+/// Order of the terms in an observation, which no config of this family contains: each program has one, and a length.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ObservationOrder {
+    /// `legged_gym`: velocities of the base, gravity, command, joints, action; 48 numbers.
+    WithVelocity,
+    /// The same without the linear velocity, which a robot does not measure; 45 numbers.
+    WithoutVelocity,
+    /// `unitree_rl_gym`: as before, and a clock of the gait at the end; 47 numbers.
+    WithClock,
+    /// `HIMLoco`: the command first, and a history; 45 numbers a step.
+    CommandFirst,
+}
+
+impl ObservationOrder {
+    /// Returns the order by the lengths of one step and of the network's input, as far as they are known.
+    pub fn of(lengths: [Option<usize>; 2]) -> Option<Self> {
+        let has = |len: usize| lengths.contains(&Some(len));
+        let has_steps_of = |one: usize| lengths.iter().flatten().any(|len| *len > one && len.is_multiple_of(one));
+        match () {
+            () if has_steps_of(45) => Some(Self::CommandFirst),
+            () if has(45) => Some(Self::WithoutVelocity),
+            () if has(47) => Some(Self::WithClock),
+            () if has(48) || has_steps_of(48) => Some(Self::WithVelocity),
+            () => None,
+        }
+    }
+
+    /// Returns the length of one step.
+    pub fn len(self) -> usize {
+        match self {
+            Self::WithVelocity => 48,
+            Self::WithoutVelocity | Self::CommandFirst => 45,
+            Self::WithClock => 47,
+        }
+    }
+
+    /// Says whose order it is.
+    pub fn description(self) -> &'static str {
+        match self {
+            Self::WithVelocity => "that of legged_gym",
+            Self::WithoutVelocity => "that of legged_gym without the linear velocity",
+            Self::WithClock => "that of unitree_rl_gym, with a gait clock of 0.8 s,",
+            Self::CommandFirst => "that of HIMLoco, with the command first",
+        }
+    }
+
+    /// Returns the terms. `scale` gives factors by their names in `obs_scales`.
+    pub fn terms(self, scale: &dyn Fn(&str) -> Option<f64>, command: Vec<f64>) -> Vec<TermFacts> {
+        let term = |term: TermName, scale: Vec<f64>| TermFacts { scale, ..TermFacts::new(term, term.name()) };
+        let scaled = |name: TermName, key: &str| term(name, scale(key).into_iter().collect());
+        let velocity = scaled(TermName::BaseLinearVelocity, "lin_vel");
+        let gyro = scaled(TermName::BaseAngularVelocity, "ang_vel");
+        let gravity = term(TermName::ProjectedGravity, Vec::new());
+        let command = term(TermName::VelocityCommand, command);
+        let mut terms = match self {
+            Self::WithVelocity => vec![velocity, gyro, gravity, command],
+            Self::CommandFirst => vec![command, gyro, gravity],
+            Self::WithoutVelocity | Self::WithClock => vec![gyro, gravity, command],
+        };
+        terms.extend([
+            scaled(TermName::JointPosition, "dof_pos"),
+            scaled(TermName::JointVelocity, "dof_vel"),
+            term(TermName::PreviousAction, Vec::new()),
+        ]);
+        if self == Self::WithClock {
+            terms.push(TermFacts { period: Some(0.8), ..term(TermName::GaitPhase, Vec::new()) });
+        }
+        terms
+    }
 }
 
 /// Returns the constants that a Python file assigns in its classes, by path without the outermost class.

@@ -106,6 +106,11 @@ impl Draft {
 
     fn merge_per_joint(&mut self, key: &'static str, what: &str, sources: &[Facts]) {
         let Some(joints) = self.joints.clone() else {
+            let known = sources.iter().find_map(|facts| values(facts, key));
+            let what = known.map_or_else(
+                || what.to_owned(),
+                |found| format!("{} has numbers, but the order of the joints is not known; name them", found.place),
+            );
             self.missing.push(format!("{key}: {what}"));
             return;
         };

@@ -1,8 +1,8 @@
 //! Mappings from the configs that training programs leave beside a policy.
 //!
 //! Each reader turns one kind of file into [`facts::Facts`], what that source says, with the place of every value: [`deploy_yaml`],
-//! [`isaac_lab`], [`rl_sar`], [`legged_gym`], [`metadata`] of the network. [`import_policy`] merges them (the first source that
-//! has a value gives it), compares them with each other and with the network, and [`text`] writes the mapping.
+//! [`isaac_lab`], [`rl_sar`], [`rl_gym`], [`legged_gym`], [`metadata`] of the network. [`import_policy`] merges them (the first
+//! source that has a value gives it), compares them with each other and with the network, and [`text`] writes the mapping.
 
 mod deploy_yaml;
 mod facts;
@@ -10,6 +10,7 @@ mod isaac_lab;
 mod legged_gym;
 mod merge;
 mod metadata;
+mod rl_gym;
 mod rl_sar;
 mod sources;
 mod text;

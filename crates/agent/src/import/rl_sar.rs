@@ -18,10 +18,8 @@ pub fn read(source: &str, config: &Yaml, base: Option<&Yaml>) -> Result<Facts, S
     let list = |key: &str| config.get(key).and_then(Yaml::numbers);
     facts.kp = list("rl_kp").map(|gains| facts.found(gains, "rl_kp"));
     facts.kd = list("rl_kd").map(|gains| facts.found(gains, "rl_kd"));
-    facts.action_scale = match config.get("action_scale") {
-        Some(Yaml::Number(scale)) => Some(facts.found(vec![*scale], "action_scale")),
-        scale => scale.and_then(Yaml::numbers).map(|scale| facts.found(scale, "action_scale")),
-    };
+    facts.action_scale =
+        config.get("action_scale").and_then(Yaml::one_or_more).map(|scale| facts.found(scale, "action_scale"));
     facts.default_pose =
         either("default_dof_pos").and_then(Yaml::numbers).map(|pose| facts.found(pose, "default_dof_pos"));
     let rate = |key: &str| either(key).and_then(Yaml::number);
@@ -87,10 +85,7 @@ fn observation(config: &Yaml) -> Result<InputFacts, String> {
             _ => None,
         };
         let mut found = TermFacts::new(term, &name);
-        found.scale = match key.and_then(|key| config.get(key)) {
-            Some(Yaml::Number(scale)) => vec![*scale],
-            scale => scale.and_then(Yaml::numbers).unwrap_or_default(),
-        };
+        found.scale = key.and_then(|key| config.get(key)).and_then(Yaml::one_or_more).unwrap_or_default();
         found.period = config.get("cycle_time").and_then(Yaml::number).filter(|_| term == TermName::GaitPhase);
         input.terms.push(found);
     }

@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 
 use super::facts::Facts;
 use super::yaml::Yaml;
-use super::{deploy_yaml, isaac_lab, legged_gym, metadata, rl_sar};
-use crate::error::AgentError;
+use super::{deploy_yaml, isaac_lab, legged_gym, metadata, rl_gym, rl_sar};
+use crate::error::{AgentError, torch_hint};
 use crate::onnx::OnnxNetwork;
 
 /// Largest config file.
@@ -20,12 +20,14 @@ pub struct Sources {
     configs: Vec<PathBuf>,
     /// The network.
     pub network: Option<OnnxNetwork>,
+    /// A network of PyTorch, if there is none in ONNX.
+    torch: Option<PathBuf>,
 }
 
 impl Sources {
     /// Looks for networks and configs.
     pub fn find(paths: &[impl AsRef<Path>]) -> Result<Self, AgentError> {
-        let (mut configs, mut networks) = (Vec::new(), Vec::new());
+        let (mut configs, mut networks, mut torch) = (Vec::new(), Vec::new(), Vec::new());
         for path in paths.iter().map(AsRef::as_ref) {
             let mut files = Vec::new();
             if path.is_dir() {
@@ -39,6 +41,7 @@ impl Sources {
                 match file.extension().and_then(|end| end.to_str()).unwrap_or_default() {
                     "onnx" => networks.push(file),
                     "yaml" | "yml" => configs.push(file),
+                    "pt" | "pth" | "jit" => torch.push(file),
                     "py" if is_given || text(&file).is_ok_and(|text| text.contains("default_joint_angles")) => {
                         configs.push(file);
                     }
@@ -60,14 +63,18 @@ impl Sources {
             [path] => Some(OnnxNetwork::read(path)?),
             [first, ..] => return Err(failed(first, "there are several networks: name the one to import")),
         };
+        let torch = torch.into_iter().next().filter(|_| network.is_none());
         if configs.is_empty() && network.is_none() {
+            if let Some(torch) = torch {
+                return Err(failed(&torch, &format!("it is a network of PyTorch{}", torch_hint(&torch))));
+            }
             let path = paths.first().map(|path| path.as_ref().to_owned()).unwrap_or_default();
             return Err(failed(
                 &path,
                 "it has neither a network (*.onnx) nor a config (deploy.yaml, env.yaml, config.yaml, *.py)",
             ));
         }
-        Ok(Self { configs, network })
+        Ok(Self { configs, network, torch })
     }
 
     /// Reads all sources, the most specific first.
@@ -92,6 +99,8 @@ impl Sources {
                 let base =
                     beside(path, "base.yaml")?.map_or_else(|| beside(path, "../base.yaml"), |base| Ok(Some(base)))?;
                 all.push((2, rl_sar::read(name, &yaml, base.as_ref()).map_err(error)?));
+            } else if yaml.get("kps").is_some() && yaml.get("default_angles").is_some() {
+                all.push((2, rl_gym::read(name, &yaml, inputs).map_err(error)?));
             }
         }
         if let Some(network) = &self.network {
@@ -105,10 +114,15 @@ impl Sources {
             return Err(failed(
                 &self.configs[0],
                 &format!(
-                    "no config of unitree_rl_lab (deploy.yaml), Isaac Lab (env.yaml), rl_sar (config.yaml) or legged_gym (*.py) is among {}",
+                    "no config of unitree_rl_lab (deploy.yaml), Isaac Lab (env.yaml), rl_sar (config.yaml), unitree_rl_gym (kps and default_angles) or legged_gym (*.py) is among {}",
                     names.join(", ")
                 ),
             ));
+        }
+        if let Some(torch) = &self.torch {
+            let name = torch.display();
+            let notes = vec![format!("`run` needs the network {name} as ONNX{}", torch_hint(torch))];
+            all.push((5, Facts { source: name.to_string(), notes, ..Facts::default() }));
         }
         Ok(all.into_iter().map(|(_, facts)| facts).collect())
     }

@@ -166,3 +166,78 @@ fn history_of_the_network_is_compared_with_that_of_the_config() {
     assert!(differs("history: the network reads 9 numbers"), "{:?}", imported.disagreements);
     assert!(imported.mapping.contains("[history]\nlength = 3"), "{}", imported.mapping);
 }
+
+const LEGGED_GYM: &str = "class GO2RoughCfg(LeggedRobotCfg):
+    class init_state(LeggedRobotCfg.init_state):
+        default_joint_angles = {'hip_joint': 0.1, 'thigh_joint': 0.8, 'calf_joint': -1.5}
+    class control(LeggedRobotCfg.control):
+        stiffness = {'joint': 20.}
+        damping = {'joint': 0.5}
+        action_scale = 0.25
+    class env(LeggedRobotCfg.env):
+        num_observations = LEN
+";
+
+fn first_terms(len: usize) -> Vec<crate::TermName> {
+    let (_, mapping) = imported(&[("go2_config.py", &LEGGED_GYM.replace("LEN", &len.to_string()))]);
+    mapping.observation.iter().take(2).map(|term| term.term).collect()
+}
+
+#[test]
+fn order_of_an_observation_that_no_config_contains_follows_from_its_length() {
+    use crate::TermName::{BaseAngularVelocity, BaseLinearVelocity, ProjectedGravity, VelocityCommand};
+    assert_eq!(first_terms(48), [BaseLinearVelocity, BaseAngularVelocity]);
+    assert_eq!(first_terms(45), [BaseAngularVelocity, ProjectedGravity], "a robot does not measure its velocity");
+    assert_eq!(first_terms(45 * 6), [VelocityCommand, BaseAngularVelocity], "HIMLoco keeps six steps");
+}
+
+const RL_GYM: &str = "joint2motor_idx: [3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8]
+kps: [21, 20, 20, 20, 20, 20, 20, 20, 20, 20, 20, 20]
+kds: [0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5]
+default_angles: [0.1, 0.8, -1.5, -0.1, 0.8, -1.5, 0.1, 1.0, -1.5, -0.1, 1.0, -1.5]
+control_dt: 0.02
+obs_scales_ang_vel: 0.25
+dof_vel_scale: 0.05
+command_scale: [2.0, 2.0, 0.25]
+action_scale: 0.25
+num_obs: 47
+";
+
+#[test]
+fn unitree_rl_gym_has_its_joints_in_the_order_of_the_motors() {
+    let (imported, mapping) = imported(&[("go2.yaml", RL_GYM)]);
+    assert_eq!(gain(&mapping, "FL_hip"), (21.0, 0.5, 0.1));
+    assert_eq!(gain(&mapping, "RR_thigh"), (20.0, 0.5, 1.0));
+    assert_eq!((mapping.policy_hz, mapping.input_len()), (50.0, 47));
+    assert_eq!(mapping.observation[0].scale, crate::Numbers::Uniform(0.25));
+    assert_eq!(mapping.observation[2].scale, crate::Numbers::Each(vec![2.0, 2.0, 0.25]));
+    assert_eq!(mapping.observation[6].term, crate::TermName::GaitPhase);
+    assert_eq!((imported.missing, imported.disagreements), (vec![], vec![]));
+    let simulated = RL_GYM.replace("control_dt: 0.02", "simulation_dt: 0.002\ncontrol_decimation: 10");
+    assert_eq!(self::imported(&[("go2.yaml", &simulated)]).1.policy_hz, 50.0);
+    for humanoid in [
+        RL_GYM.replace("joint2motor", "leg_joint2motor"),
+        format!("{RL_GYM}xml_path: robots/g1_description/scene.xml\n"),
+    ] {
+        let (_folder, path) = written(&[("g1.yaml", &humanoid)]);
+        let error = import_policy(&[path]).expect_err("a humanoid").to_string();
+        assert!(error.contains("humanoid"), "{error}");
+    }
+}
+
+#[test]
+fn networks_of_pytorch_come_with_the_line_that_converts_them() {
+    let (_folder, path) = written(&[("motion.pt", "PK"), ("go2.yaml", RL_GYM)]);
+    let error = import_policy(&[path.join("motion.pt")]).expect_err("PyTorch").to_string();
+    assert!(error.contains("torch.onnx.export(torch.jit.load("), "{error}");
+    let imported = import_policy(&[path]).expect("the config is enough");
+    assert!(imported.notes.iter().any(|note| note.contains("torch.onnx.export(")), "{:?}", imported.notes);
+}
+
+#[test]
+fn numbers_of_joints_without_names_are_not_called_missing() {
+    let (_folder, path) = written(&[("config.yaml", RL_SAR)]);
+    let imported = import_policy(&[path]).expect("sources");
+    let line = "kp: config.yaml, rl_kp has numbers, but the order of the joints is not known; name them";
+    assert!(imported.missing.contains(&line.to_owned()), "{:?}", imported.missing);
+}

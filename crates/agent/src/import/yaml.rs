@@ -67,6 +67,11 @@ impl Yaml {
         if let Self::Text(text) = self { Some(text) } else { None }
     }
 
+    /// Returns a list of numbers, or the only number.
+    pub fn one_or_more(&self) -> Option<Vec<f64>> {
+        self.number().map(|number| vec![number]).or_else(|| self.numbers())
+    }
+
     /// Returns a list of numbers.
     pub fn numbers(&self) -> Option<Vec<f64>> {
         if let Self::List(items) = self { items.iter().map(Self::number).collect() } else { None }
