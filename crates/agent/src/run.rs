@@ -14,6 +14,10 @@ use crate::policy_input::PolicyInput;
 use crate::recorder::Recorder;
 use crate::summary::{RunSummary, Sums};
 
+/// Time with a velocity command of zero at the end of a run on a real robot [s]. A robot that is left in the middle of a stride
+/// stands on two legs.
+const BRAKE_S: f64 = 0.8;
+
 /// What to run.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RunPlan {
@@ -114,7 +118,8 @@ impl Layout {
 ///
 /// `control` is called before every step, with the robot to look at. After a fall the robot is reset and the run goes on;
 /// one that was stopped by a fault ends the run unless the plan goes on.
-/// If it fails, the rows of all executed steps are in the log.
+/// If it fails, the rows of all executed steps are in the log. A real robot that follows velocities gets some steps more with a
+/// velocity of zero, which are not part of the run.
 pub fn run(
     env: &mut dyn VecEnv,
     policy: &mut BoundPolicy,
@@ -173,6 +178,10 @@ pub fn run(
                 recorder.begin_episode();
             }
         }
+    }
+    if env.real_time().is_some() && agent.uses_commands {
+        // The run is complete: without its client the endpoint holds the robot, and lets it sit down.
+        agent.brake(env, policy, &spec, &mut pacer).ok();
     }
     let rows = recorders.steps.map_or(0, |recorder| recorder.rows());
     let rows = rows + recorders.joints.map_or(0, |recorder| recorder.rows());
@@ -282,6 +291,26 @@ impl Agent {
             self.time_steps += 1;
         }
         Ok(ended)
+    }
+
+    /// Steps a walking robot to a stand.
+    fn brake(
+        &mut self,
+        env: &mut dyn VecEnv,
+        policy: &mut BoundPolicy,
+        spec: &EnvSpec,
+        pacer: &mut Pacer,
+    ) -> Result<(), AgentError> {
+        let still = WantedCommands::velocity(Some([0.0; 3]));
+        let mut outside = Sums::default();
+        for _ in 0..(BRAKE_S / spec.policy_dt).round() as u64 {
+            let action = self.action(policy, still.velocity, spec, &mut outside)?;
+            pacer.wait();
+            if self.step(env, still, &action, &mut outside)? {
+                break;
+            }
+        }
+        Ok(())
     }
 
     /// Checks after the first step with a command that the endpoint uses it.

@@ -1,11 +1,13 @@
-//! Configs of the deployment programs of unitree_rl_gym: `deploy_real/configs/*.yaml` and `deploy_mujoco/configs/*.yaml`.
+//! Configs of the deployment programs of unitree_rl_gym and its descendants: `deploy_real/configs/*.yaml`,
+//! `deploy_mujoco/configs/*.yaml`.
 //!
-//! `joint2motor_idx` gives the motor of each joint of the policy; without it the order is that of the MuJoCo model, leg by leg.
-//! The observation is that of the program, by its length.
+//! `joint2motor_idx` or `leg_joint2motor_idx` gives the motor of each joint of the policy; without it the order is that of the
+//! MuJoCo model, leg by leg. Gains are lists (`kps`) or one number (`ctrl_kp`). The order of the observation is in no config.
 
-use super::facts::{BY_LEG, BY_MOTOR, Facts, InputFacts};
+use super::facts::{BY_LEG, BY_MOTOR, Facts, InputFacts, history};
 use super::legged_gym::ObservationOrder;
 use super::yaml::Yaml;
+use crate::mapping::{HistoryLayout, HistoryOrder};
 
 /// Reads the file. `inputs` is the length of the network's input, if it is known.
 pub fn read(source: &str, yaml: &Yaml, inputs: Option<usize>) -> Result<Facts, String> {
@@ -13,14 +15,16 @@ pub fn read(source: &str, yaml: &Yaml, inputs: Option<usize>) -> Result<Facts, S
     check_robot(yaml)?;
     let list = |key: &str| yaml.get(key).and_then(Yaml::one_or_more);
     let number = |key: &str| yaml.get(key).and_then(Yaml::number);
-    facts.joints = Some(if let Some(motors) = list("joint2motor_idx") {
-        facts.found(names(&motors)?, "joint2motor_idx, the motors of the Go2")
+    // The first of several keys that the file has.
+    let any = |keys: [&'static str; 2]| keys.into_iter().find_map(|key| list(key).map(|values| (key, values)));
+    facts.joints = Some(if let Some((key, motors)) = any(["joint2motor_idx", "leg_joint2motor_idx"]) {
+        facts.found(names(key, &motors)?, &format!("{key}, the motors of the Go2"))
     } else {
         facts.notes.push("the config does not name the joints: FL, FR, RL, RR, leg by leg, are taken".to_owned());
         facts.found(BY_LEG.map(str::to_owned).to_vec(), "no joint2motor_idx: leg by leg")
     });
-    facts.kp = list("kps").map(|gains| facts.found(gains, "kps"));
-    facts.kd = list("kds").map(|gains| facts.found(gains, "kds"));
+    facts.kp = any(["kps", "ctrl_kp"]).map(|(key, gains)| facts.found(gains, key));
+    facts.kd = any(["kds", "ctrl_kd"]).map(|(key, gains)| facts.found(gains, key));
     facts.default_pose = list("default_angles").map(|pose| facts.found(pose, "default_angles"));
     facts.action_scale = list("action_scale").map(|scale| facts.found(scale, "action_scale"));
     let simulated = number("simulation_dt").zip(number("control_decimation")).map(|(dt, count)| dt * count);
@@ -28,13 +32,17 @@ pub fn read(source: &str, yaml: &Yaml, inputs: Option<usize>) -> Result<Facts, S
         (Some(dt), _) => Some(facts.found(1.0 / dt, "control_dt")),
         (None, dt) => dt.map(|dt| facts.found(1.0 / dt, "simulation_dt · control_decimation")),
     };
-    let step = number("num_obs").map(|len| len as usize);
+    let step = number("num_obs").or_else(|| number("num_single_obs")).map(|len| len as usize);
+    let steps = number("frame_stack").unwrap_or(1.0).clamp(1.0, 1e3) as usize;
+    // A network with several inputs reads the present observation apart from the history.
+    let is_stacked = inputs.is_none() || inputs == step.map(|step| step * steps);
     match ObservationOrder::of([step, inputs]) {
         Some(order) => {
             let scale = |key: &str| number(&format!("{key}_scale")).or_else(|| number(&format!("obs_scales_{key}")));
-            let command = list("cmd_scale").or_else(|| list("command_scale")).unwrap_or_default();
-            let input = InputFacts { terms: order.terms(&scale, command), ..InputFacts::default() };
-            facts.observation = Some(facts.found(input, "num_obs"));
+            let command = any(["cmd_scale", "command_scale"]).map_or_else(Vec::new, |(_, scale)| scale);
+            let history = history(if is_stacked { steps } else { 1 }, HistoryLayout::Frames, HistoryOrder::OldestFirst);
+            let input = InputFacts { terms: order.terms(&scale, command), unknown: Vec::new(), history };
+            facts.observation = Some(facts.found(input, "number of observations"));
             facts.notes.push(format!(
                 "the config does not contain the order of the observation: {} is taken; compare it with the program that runs the policy",
                 order.description()
@@ -48,26 +56,24 @@ pub fn read(source: &str, yaml: &Yaml, inputs: Option<usize>) -> Result<Facts, S
     Ok(facts)
 }
 
-/// The configs of humanoids have the same keys, and legs of six joints.
+/// The configs of humanoids have the same keys, and twelve joints in their legs.
 fn check_robot(yaml: &Yaml) -> Result<(), String> {
-    let path =
-        ["xml_path", "policy_path"].into_iter().find_map(|key| yaml.get(key).and_then(Yaml::text)).unwrap_or_default();
-    let is_humanoid = |part: &str| ["g1", "h1", "h1_2", "g1_description", "h1_description"].contains(&part);
-    if yaml.get("leg_joint2motor_idx").is_some() || path.split('/').any(is_humanoid) {
-        return Err(
-            "it is the config of a humanoid with twelve joints in its legs; the endpoints have robots with four legs"
-                .to_owned(),
-        );
+    let path = |key: &str| yaml.get(key).and_then(Yaml::text).unwrap_or_default();
+    let is_humanoid = |part: &str| part.split('_').next().is_some_and(|robot| robot == "g1" || robot == "h1");
+    if yaml.get("arm_waist_joint2motor_idx").is_some()
+        || [path("xml_path"), path("policy_path")].iter().any(|path| path.split('/').any(is_humanoid))
+    {
+        return Err("it is the config of a humanoid; `run` and the endpoints have robots with four legs".to_owned());
     }
     Ok(())
 }
 
-fn names(motors: &[f64]) -> Result<Vec<String>, String> {
+fn names(key: &str, motors: &[f64]) -> Result<Vec<String>, String> {
     let name = |motor: &f64| {
         BY_MOTOR.iter().enumerate().find(|(index, _)| *index as f64 == *motor).map(|(_, name)| (*name).to_owned())
     };
     let names: Option<Vec<String>> = motors.iter().map(name).collect();
     names
         .filter(|names| names.len() == BY_MOTOR.len())
-        .ok_or_else(|| format!("`joint2motor_idx` = {motors:?}; the indices of twelve motors, 0 to 11, are expected"))
+        .ok_or_else(|| format!("`{key}` = {motors:?}; the indices of twelve motors, 0 to 11, are expected"))
 }

@@ -99,7 +99,7 @@ impl Sources {
                 let base =
                     beside(path, "base.yaml")?.map_or_else(|| beside(path, "../base.yaml"), |base| Ok(Some(base)))?;
                 all.push((2, rl_sar::read(name, &yaml, base.as_ref()).map_err(error)?));
-            } else if yaml.get("kps").is_some() && yaml.get("default_angles").is_some() {
+            } else if yaml.get("default_angles").is_some() && yaml.get("action_scale").is_some() {
                 all.push((2, rl_gym::read(name, &yaml, inputs).map_err(error)?));
             }
         }
@@ -114,7 +114,7 @@ impl Sources {
             return Err(failed(
                 &self.configs[0],
                 &format!(
-                    "no config of unitree_rl_lab (deploy.yaml), Isaac Lab (env.yaml), rl_sar (config.yaml), unitree_rl_gym (kps and default_angles) or legged_gym (*.py) is among {}",
+                    "no config of unitree_rl_lab (deploy.yaml), Isaac Lab (env.yaml), rl_sar (config.yaml), unitree_rl_gym (with default_angles) or legged_gym (*.py) is among {}",
                     names.join(", ")
                 ),
             ));

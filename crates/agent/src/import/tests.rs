@@ -216,13 +216,24 @@ fn unitree_rl_gym_has_its_joints_in_the_order_of_the_motors() {
     let simulated = RL_GYM.replace("control_dt: 0.02", "simulation_dt: 0.002\ncontrol_decimation: 10");
     assert_eq!(self::imported(&[("go2.yaml", &simulated)]).1.policy_hz, 50.0);
     for humanoid in [
-        RL_GYM.replace("joint2motor", "leg_joint2motor"),
+        format!("{RL_GYM}arm_waist_joint2motor_idx: [12, 13]\n"),
         format!("{RL_GYM}xml_path: robots/g1_description/scene.xml\n"),
     ] {
         let (_folder, path) = written(&[("g1.yaml", &humanoid)]);
         let error = import_policy(&[path]).expect_err("a humanoid").to_string();
         assert!(error.contains("humanoid"), "{error}");
     }
+}
+
+#[test]
+fn gains_of_all_joints_and_a_stack_of_observations_are_read() {
+    let text = RL_GYM
+        .replace("joint2motor", "leg_joint2motor")
+        .replace("kps: [21, 20, 20, 20, 20, 20, 20, 20, 20, 20, 20, 20]", "stand_kp: 60\nctrl_kp: 22")
+        .replace("num_obs: 47", "num_single_obs: 45\nframe_stack: 10");
+    let (_, mapping) = imported(&[("ee.yaml", &text)]);
+    assert_eq!((gain(&mapping, "RL_calf").0, mapping.input_len()), (22.0, 450));
+    assert_eq!(mapping.history.expect("a history").order, crate::HistoryOrder::OldestFirst);
 }
 
 #[test]
