@@ -216,11 +216,17 @@ impl VecEnv for TreeEnv {
         if !episode.running && episode.length == 0 {
             return Err(EnvError::NeedsReset { env });
         }
-        let state = &self.simulation.states()[env].state;
+        let TreeReadings { state, tau, shape_force } = &self.simulation.states()[env];
         let [w, x, y, z] = state.base_orientation;
         let rotation = DQuat::from_xyzw(x, y, z, w).normalize();
         let base = DAffine3::from_rotation_translation(rotation, state.base_position.into());
-        Ok(Scene::of_tree(&self.robot.tree, base, &state.q, &Ground::FLAT))
+        let numbers = |values: &[f64]| Some(values.iter().map(|value| *value as f32).collect());
+        Ok(Scene {
+            torque: numbers(tau),
+            contact_force: numbers(shape_force),
+            reward_terms: episode.terms.clone(),
+            ..Scene::of_tree(&self.robot.tree, base, &state.q, &Ground::FLAT)
+        })
     }
 }
 

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use twinstep_effects::{NominalGain, TreeModelFile};
 use twinstep_envs::{ControlledRobot, PoseConfig, PoseTask, Randomisation, TaskConfig};
-use twinstep_model::{AutoresetMode, BaseMount, JOINT_NAMES, TreeModel, VecEnv, go2};
+use twinstep_model::{AutoresetMode, BaseMount, JOINT_NAMES, RobotTree, TreeModel, VecEnv, go2};
 use twinstep_protocol::random_u64;
 use twinstep_sim::{BackendBuildError, Placement, SimConfig, Terrain, TreeSimulation};
 
@@ -55,6 +55,11 @@ impl TreeEnvFactory {
     /// Returns the name of the robot.
     pub fn robot_name(&self) -> &str {
         &self.control.name
+    }
+
+    /// Returns the tree of the robot.
+    pub fn tree(&self) -> &RobotTree {
+        &self.robot.tree
     }
 
     fn simulation(&self, num_envs: usize) -> Result<TreeSimulation, BackendBuildError> {

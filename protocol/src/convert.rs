@@ -442,7 +442,7 @@ pub fn decode_scene(reply: message::RenderReply<'_>) -> Result<Scene, ErrorReply
         command,
         velocity: None,
         torque: None,
-        foot_force: None,
+        contact_force: None,
         reward_terms: Vec::new(),
         uncertainty: None,
     })

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use twinstep_env_server::{Config, EnvFactory, SimEnvFactory};
 use twinstep_learning::{PpoConfig, Trainer};
-use twinstep_model::{AutoresetMode, ResetRequest, VecEnv};
+use twinstep_model::{AutoresetMode, ResetRequest, VecEnv, go2};
 use twinstep_policy::{Collector, StepCollector};
 use twinstep_viewer::{Frame, Hub, MAX_ROBOTS, RobotFrame, SceneInfo, WatchedVecEnv, WebServer};
 
@@ -71,7 +71,7 @@ fn robots(count: usize) -> Result<Box<dyn VecEnv>, BenchError> {
 
 /// Serves a page of robots like these, and reads it without drawing.
 fn open_page(env: &mut dyn VecEnv) -> Result<(Arc<Hub>, WebServer), BenchError> {
-    let scene = SceneInfo::new("bench", &env.scene(0).map_err(failed)?, [f32::NAN; 12]);
+    let scene = SceneInfo::new("bench", &env.scene(0).map_err(failed)?, &go2());
     let hub = Arc::new(Hub::new(scene));
     let server = WebServer::start(([127, 0, 0, 1], 0).into(), None, Arc::clone(&hub)).map_err(failed)?;
     let mut page =

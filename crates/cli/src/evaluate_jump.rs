@@ -152,7 +152,8 @@ impl Jumper {
         if self.landing.is_some() {
             return;
         }
-        let touches = scene.foot_force.is_none_or(|force| force.iter().any(|force| *force > CONTACT_FORCE_THRESHOLD));
+        let touches =
+            scene.contact_force.as_ref().is_none_or(|force| force.iter().any(|force| *force > CONTACT_FORCE_THRESHOLD));
         if !touches {
             if self.has_stood {
                 self.in_air.push(sample(scene, robot));
@@ -288,7 +289,7 @@ mod tests {
         let q = robot.control.default_pose_f32();
         let scene = |yaw: f32, height: f32, force: f32| {
             let base = Pose { position: Vec3::new(0.0, 0.0, 0.3 + height), rotation: Quat::from_rotation_z(yaw) };
-            Scene { foot_force: Some([force; 4]), ..Scene::new(&robot, base, &q, &Ground::FLAT) }
+            Scene { contact_force: Some(vec![force; 4]), ..Scene::new(&robot, base, &q, &Ground::FLAT) }
         };
         let mut jumper = Jumper::default();
         // 2.4 rad on the ground, then 0.1 rad in each step in the air, beyond an angle of π.

@@ -25,7 +25,7 @@ impl RobotView {
     /// Shows the robot until [`RobotHandle::end`], also on a page, if there is to be one.
     pub fn start(args: &ViewArgs, robot: &RobotModel, handle: &RobotHandle) -> Result<Self, Failure> {
         let standing = scene(robot, &robot.control.default_pose_f32(), [1.0, 0.0, 0.0, 0.0]);
-        let hub = Arc::new(Hub::new(SceneInfo::new("twinstep robot", &standing, robot.torque_limits())));
+        let hub = Arc::new(Hub::new(SceneInfo::new("twinstep robot", &standing, robot)));
         let page = args.serve(&hub)?;
         let (robot, handle, shown) = (robot.clone(), handle.clone(), Arc::clone(&hub));
         let thread = std::thread::Builder::new().name("view".to_owned()).spawn(move || {
@@ -62,7 +62,7 @@ fn publish(robot: &RobotModel, board: &Board, hub: &Hub) {
         ("supply voltage [V]", f64::from(reading.voltage)),
     ];
     let scene = scene(robot, &reading.q, reading.orientation);
-    let frame = RobotFrame { torque: Some(reading.tau), ..RobotFrame::of_scene(&scene) };
+    let frame = RobotFrame { torque: Some(reading.tau.to_vec()), ..RobotFrame::of_scene(&scene) };
     hub.publish(&Frame {
         time: board.now.as_secs_f64(),
         robots: vec![frame],

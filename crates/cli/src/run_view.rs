@@ -35,7 +35,7 @@ impl RunView {
         })?;
         let title = format!("twinstep run on {}", env.spec().robot);
         let bounds = if steers { slider_bounds(env.spec()) } else { None };
-        let info = SceneInfo { velocity_bounds: bounds, ..SceneInfo::new(title, &scene, go2().torque_limits()) };
+        let info = SceneInfo { velocity_bounds: bounds, ..SceneInfo::new(title, &scene, &go2()) };
         let page = args.serve(&Arc::new(Hub::new(info)))?;
         Ok(page.map(|page| Self { page, bounds, velocity: Cell::new(None) }))
     }

@@ -6,12 +6,11 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use glam::Quat;
 use indicatif::{ProgressBar, ProgressStyle};
 use twinstep_agent::read_contract;
 use twinstep_env_server::{Config, EnvFactory, Server, ServerConfig, ServerError, SimEnvFactory, TreeEnvFactory};
 use twinstep_envs::TaskConfig;
-use twinstep_model::{AutoresetMode, InitialState, Pose, ResetRequest, RobotModel, Scene};
+use twinstep_model::{AutoresetMode, ResetRequest, Scene};
 use twinstep_sim::{Engine, SimConfig};
 use twinstep_viewer::{Hub, SceneInfo};
 
@@ -103,11 +102,6 @@ pub struct Args {
     until_stdin_closes: bool,
 }
 
-/// The page shows quadrupeds like the Go2 only.
-#[derive(Debug, thiserror::Error)]
-#[error("`--view`: robots of the task `pose` cannot be shown yet; leave it out")]
-struct NotShown;
-
 /// Serves until a signal or, with `--until-stdin-closes`, the end of stdin.
 pub fn run(args: &Args) -> CommandResult {
     // The parent may end at any time from now on.
@@ -115,24 +109,33 @@ pub fn run(args: &Args) -> CommandResult {
     let config = args.config()?;
     let signals = Signals::listen_unhurried()?;
     if let TaskConfig::Pose(_) = config.task {
-        if args.view.is_wanted() {
-            return Err(input(NotShown));
-        }
         let factory = TreeEnvFactory::new(&config).map_err(input)?;
         let name = config.server.name_of(factory.robot_name());
-        let server = start(&config.server, Arc::new(factory))?;
-        let outcome = serve(args, &config, &name, &server, &signals, is_orphan.as_ref());
-        server.shutdown();
-        return outcome;
+        let scene = scene(&name, &factory, |title, scene| SceneInfo::of_tree(title, scene, factory.tree()))?;
+        return show_and_serve(args, &config, &name, factory, scene, &signals, is_orphan.as_ref());
     }
     let factory = SimEnvFactory::new(config.clone()).map_err(input)?;
     let name = config.server.name_of(&factory.robot().name);
-    let hub = Arc::new(Hub::new(scene(&config, factory.robot())));
+    let scene = scene(&name, &example(&config)?, |title, scene| SceneInfo::new(title, scene, factory.robot()))?;
+    show_and_serve(args, &config, &name, factory, scene, &signals, is_orphan.as_ref())
+}
+
+/// Serves the environments of a factory, with a page of its robots.
+fn show_and_serve(
+    args: &Args,
+    config: &Config,
+    name: &str,
+    factory: impl EnvFactory + 'static,
+    scene: SceneInfo,
+    signals: &Signals,
+    is_orphan: Option<&OrphanCheck>,
+) -> CommandResult {
+    let hub = Arc::new(Hub::new(scene));
     let _page = args.view.serve(&hub)?;
     let factory = WatchedFactory { factory, hub: Arc::clone(&hub) };
     let server = start(&config.server, Arc::new(factory))?;
     let feed = FrameFeed::start(server.frame_publisher().map_err(other)?, hub)?;
-    let outcome = serve(args, &config, &name, &server, &signals, is_orphan.as_ref());
+    let outcome = serve(args, config, name, &server, signals, is_orphan);
     feed.stop();
     server.shutdown();
     outcome
@@ -168,28 +171,22 @@ fn serve(
     watch(server, signals, &|| stdin_closed.load(Ordering::Acquire) || is_orphan.is_some_and(OrphanCheck::is_orphan))
 }
 
-/// Returns a robot that stands at the origin, with the reward terms of its task.
-fn scene(config: &Config, robot: &RobotModel) -> SceneInfo {
-    let (q, ground) = (robot.control.default_pose_f32(), config.sim.terrain.ground());
-    let position = InitialState::standing_on(&ground, robot, q, 0.0).base_position;
-    let pose = Pose { position: position.into(), rotation: Quat::IDENTITY };
-    let scene = Scene::new(robot, pose, &q, &ground.crop(0.0, 0.0));
-    let info = SceneInfo::new(
-        format!("twinstep serve, robot {}", config.server.name_of(&robot.name)),
-        &scene,
-        robot.torque_limits(),
-    );
-    reward_terms(config).map_or(info.clone(), |names| info.with_reward_terms(&names))
+/// Returns the factory of the robots of a page. The engine makes no difference.
+fn example(config: &Config) -> Result<SimEnvFactory, Failure> {
+    let sim = SimConfig { engine: Engine::Batch, threads: 1, ..config.sim };
+    SimEnvFactory::new(Config { sim, ..config.clone() }).map_err(input)
 }
 
-/// Returns the reward terms of the task; `None` if it has no robots to show. The engine makes no difference.
-fn reward_terms(config: &Config) -> Option<Vec<String>> {
-    let sim = SimConfig { engine: Engine::Batch, threads: 1, ..config.sim };
-    let example = SimEnvFactory::new(Config { sim, ..config.clone() }).ok()?;
-    let mut env = example.build(1, AutoresetMode::Disabled, None).ok()?;
-    env.reset(&ResetRequest::default()).ok()?;
-    env.scene(0).ok()?;
-    Some(env.spec().reward_terms.clone())
+/// Returns the first scene of a robot, with the reward terms of its task.
+fn scene(
+    name: &str,
+    factory: &impl EnvFactory,
+    info: impl FnOnce(String, &Scene) -> SceneInfo,
+) -> Result<SceneInfo, Failure> {
+    let mut env = factory.build(1, AutoresetMode::Disabled, None).map_err(input)?;
+    env.reset(&ResetRequest::default()).map_err(other)?;
+    let first = env.scene(0).map_err(other)?;
+    Ok(info(format!("twinstep serve, robot {name}"), &first).with_reward_terms(&env.spec().reward_terms))
 }
 
 impl Args {

@@ -280,8 +280,8 @@ fn open_page(args: &Args, config: &TrainConfig) -> Result<Option<Page>, Failure>
         return Ok(None);
     }
     let mut example = config.envs(1, 1, 1)?.remove(0);
-    let limits = config.robot()?.torque_limits();
-    args.view.open(&format!("twinstep train {}", config.task.name()), example.as_mut(), limits)
+    let robot = config.robot()?;
+    args.view.open(&format!("twinstep train {}", config.task.name()), example.as_mut(), &robot)
 }
 
 /// Returns a point of the learning curve as a page shows it.

@@ -1,4 +1,4 @@
-//! `twinstep view`: a policy, a log or the robots of an endpoint in the browser.
+//! `twinstep view`: a policy, a log, a robot file or the robots of an endpoint in the browser.
 
 use std::path::{Path, PathBuf};
 
@@ -8,16 +8,19 @@ use twinstep_viewer::{Frame, SceneInfo, static_page, write_mcap};
 use crate::exit::{CommandResult, Failure, Signals, input, other};
 use crate::view_policy::WalkArgs;
 use crate::web_view::PageArgs;
-use crate::{view_endpoint, view_log, view_policy};
+use crate::{view_endpoint, view_log, view_policy, view_tree};
 
-/// Look at a policy, a log or the robots of an endpoint in the browser.
+/// Look at a policy, a log, a robot file or the robots of an endpoint in the browser.
 ///
 /// POLICY (*.safetensors, *.onnx): robots walk with it in simulation. The page has pause and slow motion, sliders for the
 /// velocity command, pushes and a new start.
 ///
 /// LOG (a file or folder, also MCAP): the measured robot, with pause, slow motion and a slider for the time. With --model
 /// the simulation under the same commands is its ghost: it starts from measured states, every 0.5 s with a floating base,
-/// once per segment with a fixed one. The curves are the errors joint by joint.
+/// once per segment with a fixed one. The curves are the errors joint by joint. A log of another robot than a quadruped like
+/// the Go2 is shown with the shapes of its --model (URDF, MJCF or a model file), without a ghost.
+///
+/// ROBOT (*.urdf, *.xml, or a model file *.toml): its joints move one after the other through their ranges.
 ///
 /// ENDPOINT (tcp/HOST:PORT, also tls, quic): the robots that step at a server (the newest lease, up to 64 robots), or the
 /// robot of `twinstep robot`. They are looked at only, and without an open page the server draws nothing.
@@ -28,11 +31,11 @@ use crate::{view_endpoint, view_log, view_policy};
 /// With --html the motion of a policy or a log is written into one file that any browser plays, without Twinstep and without a
 /// network. With --mcap it is written with Foxglove's schemas: scene and curves in Foxglove, poses in Rerun.
 ///
-/// Examples: `twinstep view data/policies/walk.safetensors --robots 16`, `twinstep view walk.mcap --model extended.toml` and
-/// `twinstep view tcp/127.0.0.1:7447`
+/// Examples: `twinstep view data/policies/walk.safetensors --robots 16`, `twinstep view walk.mcap --model extended.toml`,
+/// `twinstep view arm.urdf` and `twinstep view tcp/127.0.0.1:7447`
 #[derive(clap::Args)]
 pub struct Args {
-    /// Policy file, log, or endpoint.
+    /// Policy file, log, robot file, or endpoint.
     target: String,
     /// Model file of the simulated robots. Default for a policy: the ideal Go2; for a log: no simulation.
     #[arg(long, value_name = "FILE")]
@@ -69,7 +72,7 @@ fn seconds(text: &str) -> Result<f64, String> {
 /// The target does not exist.
 #[derive(Debug, thiserror::Error)]
 #[error(
-    "there is no file or folder {0}\n  give a policy (*.safetensors, *.onnx), a log, or an endpoint (tcp/HOST:PORT)"
+    "there is no file or folder {0}\n  give a policy (*.safetensors, *.onnx), a log, a robot file (*.urdf, *.xml), or an endpoint (tcp/HOST:PORT)"
 )]
 struct NoTarget(String);
 
@@ -98,12 +101,16 @@ pub fn run(args: &Args) -> CommandResult {
     if args.html.is_none() && args.mcap.is_none() {
         return if is_policy {
             view_policy::run(path, model, &args.walk, &args.page, &signals)
+        } else if view_tree::is_robot(path) {
+            view_tree::run(path, &args.page, &signals)
         } else {
             view_log::run(path, model, &args.page, &signals)
         };
     }
     let (scene, frames) = if is_policy {
         view_policy::motion(path, model, &args.walk, args.seconds, &signals)?
+    } else if view_tree::is_robot(path) {
+        view_tree::motion(path, args.seconds)?
     } else {
         view_log::motion(path, model, args.seconds)?
     };

@@ -1,25 +1,20 @@
 //! A log in the browser: the measured robot, and the simulation under the same commands as its ghost.
 
 use std::path::Path;
-use std::time::{Duration, Instant};
 
 use twinstep_identify::{Experiment, WindowConfig};
 use twinstep_logs::Log;
 use twinstep_model::{FIXED_BASE_HEIGHT, Ground, InitialState, Joint, PerJoint, Pose, RobotModel, Scene, frames};
 use twinstep_sim::BatchRollout;
-use twinstep_viewer::{Frame, Hub, PageRequest, Playback, RobotFrame, SceneInfo, static_page};
+use twinstep_viewer::{Frame, RobotFrame, SceneInfo, static_page};
 
 use crate::exit::{CommandResult, Failure, Signals, input};
 use crate::open_log::open_log;
+use crate::player::{Curves, Player};
 use crate::robot_file::SimulatedRobot;
+use crate::tree_model::tree_model;
+use crate::view_tree;
 use crate::web_view::PageArgs;
-
-/// Time between two looks at the requests.
-const TICK: Duration = Duration::from_millis(10);
-/// Frames per second of a file.
-const FRAME_RATE: f64 = 30.0;
-/// Slowest and fastest speed.
-const SPEEDS: [f64; 2] = [0.05, 4.0];
 
 /// Plays a log until a signal.
 pub fn run(path: &Path, model: Option<&Path>, page: &PageArgs, signals: &Signals) -> CommandResult {
@@ -42,6 +37,9 @@ pub fn page_with_ghost(log: Log, title: String, robot: SimulatedRobot, seconds: 
 
 fn open(path: &Path, model: Option<&Path>) -> Result<(Player, SceneInfo), Failure> {
     let log = open_log(path)?;
+    if let Some(file) = model.map(|_| tree_model(model, &log)).transpose()?.flatten() {
+        return view_tree::log(&log, path, &file);
+    }
     let robot = SimulatedRobot::load(model, &log, path)?;
     player(log, path.display().to_string(), robot, model.is_some())
 }
@@ -50,11 +48,11 @@ fn player(log: Log, title: String, robot: SimulatedRobot, has_ghost: bool) -> Re
     let SimulatedRobot { robot, mut simulator } = robot;
     let measured = measured_poses(&log, &robot);
     let simulated = if has_ghost { simulated_poses(&log, &robot, &mut simulator)? } else { Vec::new() };
-    let info = SceneInfo::new(title, &measured[0].scene(&robot), robot.torque_limits());
+    let info = SceneInfo::new(title, &measured[0].scene(&robot), &robot);
     let scene = SceneInfo { is_interactive: true, has_ghost, ..info };
-    let duration = log.t()[log.rows() - 1] - log.t()[0];
-    let player = Player { log, robot, measured, simulated, time: 0.0, duration, is_paused: false, speed: 1.0 };
-    Ok((player, scene))
+    let times = log.t().to_vec();
+    let motion = Motion { log, robot, measured, simulated };
+    Ok((Player::new(times, move |row| motion.at(row)), scene))
 }
 
 /// Pose of the robot at one time.
@@ -110,75 +108,19 @@ fn simulated_poses(
     Ok(poses)
 }
 
-struct Player {
+/// A log with the robot at each row, and with its simulation, if there is one.
+struct Motion {
     log: Log,
     robot: RobotModel,
     measured: Vec<RobotPose>,
     /// Empty without a model.
     simulated: Vec<Option<RobotPose>>,
-    /// Time since the first row [s].
-    time: f64,
-    duration: f64,
-    is_paused: bool,
-    speed: f64,
 }
 
-impl Player {
-    fn run(&mut self, hub: &Hub, signals: &Signals) -> CommandResult {
-        let mut last = Instant::now();
-        while !signals.check()? {
-            for request in hub.take_requests() {
-                self.obey(request);
-            }
-            let elapsed = last.elapsed().as_secs_f64();
-            last = Instant::now();
-            if !self.is_paused && hub.pages() > 0 {
-                self.time = (self.time + self.speed * elapsed).min(self.duration);
-                // The last row stays until somebody goes back.
-                self.is_paused = self.time >= self.duration;
-            }
-            if hub.is_due() {
-                hub.publish(&self.frame());
-            }
-            std::thread::sleep(TICK);
-        }
-        Ok(())
-    }
-
-    /// Returns the frames of the first seconds.
-    fn motion(mut self, seconds: f64) -> Vec<Frame> {
-        let count = (seconds.min(self.duration) * FRAME_RATE).floor() as usize;
-        let frame = |index| {
-            self.time = index as f64 / FRAME_RATE;
-            self.frame()
-        };
-        (0..=count).map(frame).collect()
-    }
-
-    fn obey(&mut self, request: PageRequest) {
-        match request {
-            PageRequest::Pause(is_paused) => {
-                if !is_paused && self.time >= self.duration {
-                    self.time = 0.0;
-                }
-                self.is_paused = is_paused;
-            }
-            PageRequest::Speed(speed) if speed.is_finite() => self.speed = speed.clamp(SPEEDS[0], SPEEDS[1]),
-            PageRequest::Seek(time) if time.is_finite() => self.time = time.clamp(0.0, self.duration),
-            _ => {}
-        }
-    }
-
-    fn row(&self) -> usize {
-        let times = self.log.t();
-        times.partition_point(|time| *time <= times[0] + self.time).saturating_sub(1)
-    }
-
-    fn frame(&self) -> Frame {
-        let row = self.row();
+impl Motion {
+    fn at(&self, row: usize) -> (RobotFrame, Curves) {
         let measured = self.measured[row];
-        let tau = Joint::ALL.map(|joint| self.log.tau_measured(joint.name()).map(|column| column[row] as f32));
-        let torque = tau.iter().all(Option::is_some).then(|| tau.map(Option::unwrap_or_default));
+        let torque = torque(&self.log, &Joint::ALL.map(Joint::name), row);
         let mut robot = RobotFrame { torque, ..RobotFrame::of_scene(&measured.scene(&self.robot)) };
         let mut curves = Vec::new();
         if self.simulated.is_empty() {
@@ -195,7 +137,11 @@ impl Player {
             };
             curves.extend(Joint::ALL.map(error));
         }
-        let playback = Playback { duration: Some(self.duration), is_paused: self.is_paused, speed: self.speed };
-        Frame { time: self.time, robots: vec![robot], curves, playback: Some(playback) }
+        (robot, curves)
     }
+}
+
+/// Returns the measured torques of a row, if those of all joints were measured.
+pub fn torque(log: &Log, joints: &[&str], row: usize) -> Option<Vec<f32>> {
+    joints.iter().map(|joint| log.tau_measured(joint).map(|column| column[row] as f32)).collect()
 }

@@ -76,11 +76,10 @@ fn start(path: &Path, model: Option<&Path>, args: &WalkArgs) -> Result<(PolicyWa
     let load = || read()?.bind(env.spec()).map_err(input);
     let policies = (0..robots).map(|_| load()).collect::<Result<Vec<_>, _>>()?;
     env.reset(&ResetRequest::seeded(args.seed, robots)).map_err(other)?;
-    let limits = factory.robot().torque_limits();
     let scene = SceneInfo {
         is_interactive: true,
         velocity_bounds: env.spec().observation_field("velocity_command").map(|_| velocity_input::limits()),
-        ..SceneInfo::new(path.display().to_string(), &env.scene(0).map_err(other)?, limits)
+        ..SceneInfo::new(path.display().to_string(), &env.scene(0).map_err(other)?, factory.robot())
     };
     let scene = scene.with_reward_terms(&env.spec().reward_terms);
     let walk = PolicyWalk { env, policies, command: None, is_paused: false, speed: 1.0, steps: 0, falls: 0 };

@@ -416,8 +416,8 @@ impl<B: Backend, T: Task> VecEnv for TaskEnv<B, T> {
         Ok(Scene {
             command: self.task.velocity_command(&episode.state),
             velocity,
-            torque: Some(robot.measured.tau[env]),
-            foot_force: robot.truth.map(|truth| truth.foot_force[env]),
+            torque: Some(robot.measured.tau[env].to_vec()),
+            contact_force: robot.truth.map(|truth| truth.foot_force[env].to_vec()),
             reward_terms: episode.terms.clone(),
             // Zero is that of actuators that do not estimate it.
             uncertainty: robot.truth.map(|truth| truth.epistemic_uncertainty[env]).filter(|value| *value != 0.0),

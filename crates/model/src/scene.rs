@@ -4,7 +4,7 @@ use glam::{DAffine3, DVec3, Quat, Vec3};
 use serde::{Deserialize, Serialize};
 
 use crate::kinematics::{Pose, body_poses};
-use crate::{Ground, JOINT_NAMES, Leg, PerJoint, PerLeg, RobotModel, RobotTree, TreeShape, TreeShapeKind};
+use crate::{Ground, JOINT_NAMES, Leg, PerJoint, RobotModel, RobotTree, TreeShape, TreeShapeKind};
 
 /// Scene for rendering. Poses are `[x, y, z, w, x, y, z]`: position [m], then quaternion.
 #[derive(Clone, Debug, PartialEq)]
@@ -21,10 +21,10 @@ pub struct Scene {
     pub command: Option<[f32; 3]>,
     /// Velocity in the base frame: forward [m/s], left [m/s], yaw [rad/s]. `None` if it is not known; a server does not send it.
     pub velocity: Option<[f32; 3]>,
-    /// Torque of each joint [N·m]. `None` if it is not known; a server does not send it.
-    pub torque: Option<PerJoint>,
-    /// Normal force on each foot [N]. `None` if it is not known; a server does not send it.
-    pub foot_force: Option<PerLeg>,
+    /// Torque of each joint [N·m], or force [N]; joint `i` moves body `i + 1`. `None` if it is not known; a server does not send it.
+    pub torque: Option<Vec<f32>>,
+    /// Normal force on each foot of a quadruped, or on each shape of a tree [N]. `None` if it is not known; a server does not send it.
+    pub contact_force: Option<Vec<f32>>,
     /// Weighted reward terms of the last step. Empty if they are not known; a server does not send them.
     pub reward_terms: Vec<f32>,
     /// Epistemic uncertainty of the actuators [nat]. `None` if it is not known; a server does not send it.
@@ -69,7 +69,7 @@ impl Scene {
             command: None,
             velocity: None,
             torque: None,
-            foot_force: None,
+            contact_force: None,
             reward_terms: Vec::new(),
             uncertainty: None,
         }
@@ -99,7 +99,7 @@ impl Scene {
             command: None,
             velocity: None,
             torque: None,
-            foot_force: None,
+            contact_force: None,
             reward_terms: Vec::new(),
             uncertainty: None,
         }

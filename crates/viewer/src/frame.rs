@@ -2,7 +2,7 @@
 
 use bytes::{BufMut, Bytes, BytesMut};
 use serde::{Deserialize, Serialize};
-use twinstep_model::{Ground, PerJoint, PerLeg, Scene, SceneShape};
+use twinstep_model::{Ground, JOINT_NAMES, Leg, RobotModel, RobotTree, Scene, SceneShape, TreeShape};
 
 /// What stays the same while a page is open.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -15,8 +15,12 @@ pub struct SceneInfo {
     pub shapes: Vec<SceneShape>,
     /// Heights of the ground; `None` for level ground at z = 0.
     pub heights: Option<Heights>,
-    /// Largest torque of each joint [N·m], for its colour.
-    pub torque_limits: PerJoint,
+    /// Names of the joints; joint `i` moves body `i + 1`.
+    pub joints: Vec<String>,
+    /// Largest torque of each joint [N·m], or force [N], for its colour; `None` if the robot's file has none.
+    pub torque_limits: Vec<Option<f32>>,
+    /// Where the ground may push the robot, in the order of [`RobotFrame::contact_force`].
+    pub contacts: Vec<Contact>,
     /// Names of the curves that each robot has: velocity, torque, height, uncertainty of its actuators, reward terms.
     #[serde(default)]
     pub robot_curves: Vec<String>,
@@ -29,6 +33,17 @@ pub struct SceneInfo {
     pub is_learning: bool,
     /// Bounds of the velocity command of the page: forward [m/s], left [m/s], yaw rate [rad/s]. `None` if it has none.
     pub velocity_bounds: Option<[[f32; 2]; 3]>,
+}
+
+/// Point of a body at which the ground pushes.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct Contact {
+    /// Name.
+    pub name: String,
+    /// Index of its body.
+    pub body: usize,
+    /// Position in the frame of the body [m].
+    pub position: [f32; 3],
 }
 
 /// Heights of the ground on a regular grid.
@@ -45,14 +60,43 @@ pub struct Heights {
 }
 
 impl SceneInfo {
-    /// Returns the description of a scene without controls.
-    pub fn new(title: impl Into<String>, scene: &Scene, torque_limits: PerJoint) -> Self {
+    /// Returns the description of a scene of a robot like the Go2, without controls.
+    pub fn new(title: impl Into<String>, scene: &Scene, robot: &RobotModel) -> Self {
+        let position = robot.shapes.foot_centre.as_vec3().to_array();
+        let foot = |leg: Leg| Contact { name: leg.name().to_owned(), body: 3 + 3 * leg as usize, position };
+        Self {
+            joints: JOINT_NAMES.map(str::to_owned).to_vec(),
+            torque_limits: robot.torque_limits().map(Some).to_vec(),
+            contacts: Leg::ALL.map(foot).to_vec(),
+            ..Self::without_joints(title, scene)
+        }
+    }
+
+    /// Returns the description of a scene of any robot, without controls.
+    pub fn of_tree(title: impl Into<String>, scene: &Scene, tree: &RobotTree) -> Self {
+        let limit = |[low, high]: [f64; 2]| low.abs().max(high.abs()) as f32;
+        let contact = |(index, shape): (usize, &TreeShape)| Contact {
+            name: format!("{}_{index}", tree.bodies[shape.body].name),
+            body: shape.body,
+            position: shape.body_from_shape.translation.as_vec3().to_array(),
+        };
+        Self {
+            joints: tree.joints.iter().map(|joint| joint.name.clone()).collect(),
+            torque_limits: tree.joints.iter().map(|joint| joint.effort.map(limit)).collect(),
+            contacts: tree.shapes.iter().enumerate().map(contact).collect(),
+            ..Self::without_joints(title, scene)
+        }
+    }
+
+    fn without_joints(title: impl Into<String>, scene: &Scene) -> Self {
         Self {
             title: title.into(),
             bodies: scene.bodies.clone(),
             shapes: scene.shapes.clone(),
             heights: heights(&scene.ground),
-            torque_limits,
+            joints: Vec::new(),
+            torque_limits: Vec::new(),
+            contacts: Vec::new(),
             robot_curves: Vec::new(),
             has_ghost: false,
             is_interactive: false,
@@ -80,7 +124,7 @@ fn robot_curves(scene: &Scene) -> Vec<f32> {
     }
     let forward = scene.velocity.map(|velocity| velocity[0]);
     let error = scene.command.zip(forward).map(|(command, forward)| command[0] - forward);
-    let torque = scene.torque.map(|torque| torque.iter().fold(0.0_f32, |largest, tau| largest.max(tau.abs())));
+    let torque = scene.torque.as_ref().map(|torque| torque.iter().fold(0.0_f32, |largest, tau| largest.max(tau.abs())));
     let height = scene.pose.first().map(|trunk| trunk[2]);
     let quantities: [_; QUANTITIES.len()] = [forward, error, torque, height, scene.uncertainty];
     let quantities = quantities.map(|value| value.unwrap_or(f32::NAN));
@@ -105,9 +149,9 @@ pub struct RobotFrame {
     /// The same of the simulation, if the scene has ghosts.
     pub ghost: Vec<[f32; 7]>,
     /// Torque of each joint [N·m]; `None` if it is not known.
-    pub torque: Option<PerJoint>,
-    /// Normal force on each foot [N]; `None` if it is not known.
-    pub foot_force: Option<PerLeg>,
+    pub torque: Option<Vec<f32>>,
+    /// Normal force at each of [`SceneInfo::contacts`] [N]; `None` if it is not known.
+    pub contact_force: Option<Vec<f32>>,
     /// Commanded velocity in the base frame: forward [m/s], left [m/s], yaw rate [rad/s].
     pub command: Option<[f32; 3]>,
     /// Velocity in the base frame: forward [m/s], left [m/s], yaw rate [rad/s].
@@ -122,8 +166,8 @@ impl RobotFrame {
         Self {
             poses: scene.pose.clone(),
             ghost: Vec::new(),
-            torque: scene.torque,
-            foot_force: scene.foot_force,
+            torque: scene.torque.clone(),
+            contact_force: scene.contact_force.clone(),
             command: scene.command,
             velocity: scene.velocity,
             curves: robot_curves(scene),
@@ -172,26 +216,36 @@ pub struct Frame {
 struct Header<'a> {
     time: f64,
     robots: usize,
+    /// Number of torques and of contact forces of each robot.
+    joints: usize,
+    contacts: usize,
     curves: std::collections::BTreeMap<&'a str, f64>,
     playback: Option<Playback>,
 }
 
 impl Frame {
     /// Returns the bytes of the frame: its length and that of its header (u32 each), the header as JSON, padding to a multiple
-    /// of four, then numbers (f32): for every robot the poses, the ghost's poses, 12 torques, 4 foot forces, 3 + 3 velocities, and
-    /// the robot's curves.
+    /// of four, then numbers (f32): for every robot the poses, the ghost's poses, as many torques and contact forces as the header
+    /// says, 3 + 3 velocities, and the robot's curves.
     /// All little-endian; a number that is not known is NaN.
     pub fn to_bytes(&self) -> Bytes {
         let curves = self.curves.iter().map(|(name, value)| (name.as_str(), *value)).collect();
-        let header = Header { time: self.time, robots: self.robots.len(), curves, playback: self.playback };
+        let most = |values: fn(&RobotFrame) -> &Option<Vec<f32>>| {
+            self.robots.iter().filter_map(|robot| values(robot).as_ref().map(Vec::len)).max().unwrap_or(0)
+        };
+        let (joints, contacts) = (most(|robot| &robot.torque), most(|robot| &robot.contact_force));
+        let header =
+            Header { time: self.time, robots: self.robots.len(), joints, contacts, curves, playback: self.playback };
         // Numbers and names are always JSON.
         let mut header = serde_json::to_vec(&header).unwrap_or_default();
         header.resize(header.len().next_multiple_of(4), b' ');
         let mut numbers = Vec::new();
         for robot in &self.robots {
             numbers.extend(robot.poses.iter().chain(&robot.ghost).flatten().copied());
-            numbers.extend(robot.torque.unwrap_or([f32::NAN; 12]));
-            numbers.extend(robot.foot_force.unwrap_or([f32::NAN; 4]));
+            for (values, count) in [(&robot.torque, joints), (&robot.contact_force, contacts)] {
+                let known = values.iter().flatten().copied();
+                numbers.extend(known.chain(std::iter::repeat(f32::NAN)).take(count));
+            }
             numbers.extend(robot.command.unwrap_or([f32::NAN; 3]));
             numbers.extend(robot.velocity.unwrap_or([f32::NAN; 3]));
             numbers.extend(&robot.curves);
@@ -214,7 +268,12 @@ mod tests {
     #[test]
     fn bytes_have_lengths_header_and_numbers() {
         let robot = RobotFrame { poses: vec![[1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0]; 2], ..RobotFrame::default() };
-        let robot = RobotFrame { torque: Some([7.0; 12]), curves: vec![0.25, 0.5], ..robot };
+        let robot = RobotFrame {
+            torque: Some(vec![7.0; 9]),
+            contact_force: Some(vec![1.0, f32::NAN]),
+            curves: vec![0.25, 0.5],
+            ..robot
+        };
         let frame = Frame { time: 0.5, robots: vec![robot.clone(), robot], ..Frame::default() };
         let bytes = frame.to_bytes();
         let word = |at: usize| u32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]);
@@ -222,11 +281,12 @@ mod tests {
         assert_eq!(bytes.len(), 8 + all);
         let text: serde_json::Value = serde_json::from_slice(&bytes[8..8 + header]).expect("JSON");
         assert_eq!((&text["time"], &text["robots"]), (&0.5.into(), &2.into()));
+        assert_eq!((&text["joints"], &text["contacts"]), (&9.into(), &2.into()));
         // Two bodies with seven numbers, torques, forces, two velocities, two curves.
-        assert_eq!(all - header, 2 * 4 * (14 + 12 + 4 + 6 + 2));
+        assert_eq!(all - header, 2 * 4 * (14 + 9 + 2 + 6 + 2));
         let number = |index: usize| f32::from_bits(word(8 + header + 4 * index));
-        assert_eq!((number(0), number(2), number(14)), (1.0, 3.0, 7.0));
-        assert!(number(26).is_nan(), "foot forces are not known");
-        assert_eq!((number(36), number(37), number(38)), (0.25, 0.5, 1.0));
+        assert_eq!((number(0), number(2), number(14), number(23)), (1.0, 3.0, 7.0, 1.0));
+        assert!(number(24).is_nan(), "a force that is not known");
+        assert_eq!((number(31), number(32), number(33)), (0.25, 0.5, 1.0));
     }
 }

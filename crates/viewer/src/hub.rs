@@ -170,7 +170,7 @@ mod tests {
         let robot = go2();
         let pose = robot.control.default_pose_f32();
         let scene = Scene::new(&robot, Pose::IDENTITY, &pose, &Ground::FLAT);
-        let info = SceneInfo::new("run", &scene, robot.torque_limits());
+        let info = SceneInfo::new("run", &scene, &robot);
         let hub = Hub::new(SceneInfo { velocity_bounds: Some([[-1.0, 1.0]; 3]), ..info });
         for _ in 0..2 * CAPACITY {
             assert!(hub.request(PageRequest::Velocity([1.0, 0.0, 0.0])));
@@ -185,7 +185,7 @@ mod tests {
     fn frame_of_another_program_is_shown_if_its_lengths_are_right() {
         let robot = go2();
         let scene = Scene::new(&robot, Pose::IDENTITY, &robot.control.default_pose_f32(), &Ground::FLAT);
-        let hub = Hub::new(SceneInfo::new("view", &scene, robot.torque_limits()));
+        let hub = Hub::new(SceneInfo::new("view", &scene, &robot));
         let mut reader = hub.subscribe();
         let frame = Frame { time: 2.0, ..Frame::default() }.to_bytes();
         assert!(hub.forward(&frame));

@@ -40,7 +40,7 @@ mod tests {
     fn page_refers_to_no_other_file_and_its_title_cannot_end_a_script() {
         let robot = go2();
         let scene = Scene::new(&robot, Pose::IDENTITY, &robot.control.default_pose_f32(), &Ground::FLAT);
-        let info = SceneInfo::new("</script><b>walk", &scene, robot.torque_limits());
+        let info = SceneInfo::new("</script><b>walk", &scene, &robot);
         let page = static_page(&info, &[Frame::default()]);
         assert!(!page.contains("src=") && !page.contains("href="), "it refers to another file");
         assert!(page.contains(r"\u003c/script>\u003cb>walk") && !page.contains("</script><b>walk"));

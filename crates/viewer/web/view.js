@@ -6,10 +6,7 @@ import {
 } from './three.min.js';
 import { Recording } from './recording.js';
 
-const JOINTS = 12;
 const MAX_ROBOTS = 64;
-const LEGS = 4;
-const FEET = ['FL', 'FR', 'RL', 'RR'];
 const CURVE_POINTS = 600;
 // Distance of neighbouring robots [m].
 const SPACING = 1.5;
@@ -114,7 +111,7 @@ function makeRobots(count) {
     return {
       ...robot,
       ghost: info.has_ghost ? build(true) : null,
-      forces: FEET.map(() => arrow(0x7bd88f)),
+      forces: info.contacts.map(() => arrow(0x7bd88f)),
       command: arrow(0xffd866),
       velocity: arrow(0x78dce8),
     };
@@ -166,7 +163,7 @@ function decode(payload) {
   const header = JSON.parse(new TextDecoder().decode(payload.subarray(4, 4 + length)));
   const numbers = new Float32Array(payload.slice(4 + length).buffer);
   const poses = 7 * info.bodies.length;
-  const stride = poses * (info.has_ghost ? 2 : 1) + JOINTS + LEGS + 6 + info.robot_curves.length;
+  const stride = poses * (info.has_ghost ? 2 : 1) + header.joints + header.contacts + 6 + info.robot_curves.length;
   header.robots = Math.min(header.robots, MAX_ROBOTS);
   header.states = Array.from({ length: header.robots }, (_, robot) => {
     let at = robot * stride;
@@ -174,14 +171,19 @@ function decode(payload) {
     return {
       poses: take(poses),
       ghost: info.has_ghost ? take(poses) : null,
-      torque: take(JOINTS),
-      force: take(LEGS),
+      torque: take(header.joints),
+      force: take(header.contacts),
       command: take(3),
       velocity: take(3),
       curves: take(info.robot_curves.length),
     };
   });
   return header;
+}
+
+// Torque of a joint by its limit; not a number if one of them is not known.
+function shareOfLimit(state, joint) {
+  return Math.abs(state.torque[joint]) / (info.torque_limits[joint] ?? NaN);
 }
 
 function showArrow(made, from, direction, length) {
@@ -192,10 +194,8 @@ function showArrow(made, from, direction, length) {
   made.setLength(length, Math.min(0.08, 0.4 * length), Math.min(0.05, 0.25 * length));
 }
 
-function footPosition(robot, leg) {
-  const foot = info.shapes.filter((shape) => shape.kind === 'sphere' && shape.body === 3 + 3 * leg).pop();
-  const position = foot ? new Vector3(...foot.offset.slice(0, 3)) : new Vector3();
-  return robot.bodies[3 + 3 * leg].localToWorld(position);
+function contactPosition(robot, contact) {
+  return robot.bodies[contact.body].localToWorld(new Vector3(...contact.position));
 }
 
 function draw(frame) {
@@ -213,14 +213,14 @@ function draw(frame) {
       robot.ghost.root.visible = Number.isFinite(state.ghost[0]);
       if (robot.ghost.root.visible) info.bodies.forEach((_, body) => place(robot.ghost.bodies[body], state.ghost, 7 * body));
     }
-    for (let joint = 0; joint < JOINTS; joint += 1) {
-      const share = Math.min(1, Math.abs(state.torque[joint]) / info.torque_limits[joint]);
+    info.joints.forEach((_, joint) => {
+      const share = Math.min(1, shareOfLimit(state, joint));
       robot.materials[1 + joint]?.color.lerpColors(IDLE, FULL, Number.isFinite(share) ? share : 0);
-    }
+    });
     robot.root.updateMatrixWorld(true);
-    robot.forces.forEach((made, leg) => {
-      const force = state.force[leg];
-      showArrow(made, footPosition(robot, leg), new Vector3(0, 0, 1), Number.isFinite(force) ? force / FORCE_SCALE : 0);
+    robot.forces.forEach((made, index) => {
+      const force = state.force[index];
+      showArrow(made, contactPosition(robot, info.contacts[index]), new Vector3(0, 0, 1), Number.isFinite(force) ? force / FORCE_SCALE : 0);
     });
     const above = robot.bodies[0].localToWorld(new Vector3(0, 0, 0.15));
     for (const [made, value, height] of [[robot.command, state.command, 0.02], [robot.velocity, state.velocity, 0]]) {
@@ -248,8 +248,9 @@ function showFacts(frame) {
   const rows = [['robot', `${chosen + 1} of ${frame.robots}`], ['time', `${frame.time.toFixed(2)} s`]];
   if (Number.isFinite(state.command[0])) rows.push(['commanded', `${[...state.command].map((v) => number(v)).join(' ')}`]);
   if (Number.isFinite(state.velocity[0])) rows.push(['velocity', `${[...state.velocity].map((v) => number(v)).join(' ')}`]);
-  if (Number.isFinite(state.torque[0])) {
-    const largest = Math.max(...state.torque.map((tau, joint) => Math.abs(tau) / info.torque_limits[joint]));
+  const shares = info.joints.map((_, joint) => shareOfLimit(state, joint)).filter(Number.isFinite);
+  if (shares.length > 0) {
+    const largest = Math.max(...shares);
     rows.push(['largest torque', `${(100 * largest).toFixed(0)} % of its limit`]);
   }
   if (state.ghost && Number.isFinite(state.ghost[0])) {

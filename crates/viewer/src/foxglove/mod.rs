@@ -9,7 +9,6 @@ use std::io::{Seek, Write};
 use mcap::McapError;
 use mcap::records::MessageHeader;
 use serde_json::{Map, Value};
-use twinstep_model::{JOINT_NAMES, Leg};
 
 use crate::frame::{Frame, RobotFrame, SceneInfo};
 
@@ -25,7 +24,7 @@ const OBJECT: &[u8] = br#"{"type":"object"}"#;
 /// |---|---|
 /// | `/tf` | `foxglove.FrameTransforms`: pose of each body `robot_0/trunk` … in `world`; `ghost_0/…` is the simulation of a log |
 /// | `/scene` | `foxglove.SceneUpdate`, once: the shapes of the bodies and the ground |
-/// | `/robot_0` … | JSON: torque [N·m], foot force [N], commanded and actual velocity [m/s, rad/s] |
+/// | `/robot_0` … | JSON: torque [N·m], contact force [N], commanded and actual velocity [m/s, rad/s] |
 /// | `/curves` | JSON: the curves beside the scene |
 pub fn write_mcap(target: impl Write + Seek, scene: &SceneInfo, frames: &[Frame]) -> Result<(), McapError> {
     let mut writer = mcap::WriteOptions::new().profile("").library("twinstep").create(target)?;
@@ -65,6 +64,8 @@ pub fn write_mcap(target: impl Write + Seek, scene: &SceneInfo, frames: &[Frame]
 
 /// Returns the known quantities of a robot.
 fn quantities(scene: &SceneInfo, robot: &RobotFrame) -> Map<String, Value> {
+    let contacts: Vec<&str> = scene.contacts.iter().map(|contact| contact.name.as_str()).collect();
+    let joints: Vec<&str> = scene.joints.iter().map(String::as_str).collect();
     let object = |names: &[&str], values: &[f32]| {
         let known = names.iter().zip(values).filter(|(_, value)| value.is_finite());
         Value::Object(known.map(|(name, value)| ((*name).to_owned(), f64::from(*value).into())).collect())
@@ -72,8 +73,8 @@ fn quantities(scene: &SceneInfo, robot: &RobotFrame) -> Map<String, Value> {
     let curves: Vec<&str> = scene.robot_curves.iter().map(String::as_str).collect();
     let axes = ["forward", "left", "yaw_rate"];
     let known = [
-        ("torque", robot.torque.map(|values| object(&JOINT_NAMES, &values))),
-        ("foot_force", robot.foot_force.map(|values| object(&Leg::ALL.map(Leg::name), &values))),
+        ("torque", robot.torque.as_ref().map(|values| object(&joints, values))),
+        ("contact_force", robot.contact_force.as_ref().map(|values| object(&contacts, values))),
         ("velocity_command", robot.command.map(|values| object(&axes, &values))),
         ("velocity", robot.velocity.map(|values| object(&axes, &values))),
         ("curves", (!robot.curves.is_empty()).then(|| object(&curves, &robot.curves))),
@@ -85,7 +86,7 @@ fn quantities(scene: &SceneInfo, robot: &RobotFrame) -> Map<String, Value> {
 mod tests {
     use std::io::Cursor;
 
-    use twinstep_model::{Ground, Pose, Scene, go2};
+    use twinstep_model::{Ground, JOINT_NAMES, Pose, Scene, go2};
 
     use super::*;
 
@@ -93,8 +94,8 @@ mod tests {
     fn recording_has_a_message_per_topic_and_frame_and_the_scene_once() {
         let robot = go2();
         let standing = Scene::new(&robot, Pose::IDENTITY, &robot.control.default_pose_f32(), &Ground::FLAT);
-        let scene = SceneInfo::new("walk", &standing, robot.torque_limits());
-        let walker = RobotFrame { torque: Some([1.5; 12]), ..RobotFrame::of_scene(&standing) };
+        let scene = SceneInfo::new("walk", &standing, &robot);
+        let walker = RobotFrame { torque: Some(vec![1.5; 12]), ..RobotFrame::of_scene(&standing) };
         let frame = |time| Frame {
             time,
             robots: vec![walker.clone(); 2],
