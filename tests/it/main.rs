@@ -9,6 +9,7 @@ static ALLOCATOR: cap::Cap<std::alloc::System> = cap::Cap::new(std::alloc::Syste
 mod any_robot;
 mod any_robot_env;
 mod any_robot_log;
+mod any_robot_programs;
 mod base_estimate;
 mod batch;
 mod bombs;

@@ -217,7 +217,7 @@ fn json(args: &Args, rows: &impl Serialize) -> String {
 
 /// Evaluates the policy by velocity commands under each condition.
 fn walking(args: &Args, policy: &Policy, signals: &Signals) -> Result<Vec<Row>, Failure> {
-    let robot = TrainConfig { model: args.model.clone(), ..TrainConfig::default() }.robot()?;
+    let robot = TrainConfig { model: args.model.clone(), ..TrainConfig::default() }.quadruped()?;
     let plan = EvaluationPlan { robot: &robot, seconds: args.seconds, seed: args.seed };
     let mut rows = Vec::new();
     for condition in args.conditions() {
@@ -300,7 +300,7 @@ fn attitudes(args: &Args, policy: &Policy, signals: &Signals) -> Result<Vec<Atti
 
 /// Evaluates the landings of the policy under each condition.
 fn jumping(args: &Args, policy: &Policy, trained: &JumpConfig, signals: &Signals) -> Result<Vec<JumpRow>, Failure> {
-    let robot = TrainConfig { model: args.model.clone(), ..TrainConfig::default() }.robot()?;
+    let robot = TrainConfig { model: args.model.clone(), ..TrainConfig::default() }.quadruped()?;
     let tasks = evaluate_jump::tasks(trained);
     let mut rows = Vec::new();
     // A jump is over before the first push.

@@ -12,6 +12,7 @@ mod evaluate_attitude;
 mod evaluate_gait;
 mod evaluate_jump;
 mod evaluate_policy;
+mod evaluate_pose;
 mod evaluate_tracking;
 mod excite;
 mod exit;

@@ -28,8 +28,8 @@ const SAVE_EVERY: Duration = Duration::from_secs(10);
 /// trajectories. The folder then contains:
 ///
 ///   policy.safetensors     the policy, with the spec of its environment
-///   policy.onnx            the same for other runtimes: input `obs` [batch, N] in SI units, output `action` [batch, 12]
-///   evaluation.json        velocity errors and falls of 256 fresh robots; task `jump`: where they land; `attitude`: its errors
+///   policy.onnx            the same for other runtimes: input `obs` [batch, N] in SI units, output `action` [batch, joints]
+///   evaluation.json        velocity errors and falls of 256 fresh robots; task `jump`: where they land; `attitude` and `pose`: errors
 ///   config.toml            all settings; --config config.toml repeats the training
 ///   progress.csv           errors, falls, reward terms and times of every update; TensorBoard reads events.out.*
 ///   curve.svg              learning curve
@@ -40,11 +40,12 @@ const SAVE_EVERY: Duration = Duration::from_secs(10);
 ///
 /// Examples: `twinstep train walk --out walk --seed 1`, or on the robot that a diagnosis found:
 /// `twinstep train walk --out walk --model diagnosis/extended.toml --randomise-effects`, or from an earlier training:
-/// `twinstep train walk --out tuned --from walk/checkpoint.safetensors --model extended.toml --steps 5000000`
+/// `twinstep train walk --out tuned --from walk/checkpoint.safetensors --model extended.toml --steps 5000000`, or any robot:
+/// `twinstep train pose --out arm --model arm.toml --steps 1000000`
 #[derive(clap::Args)]
 pub struct Args {
     /// Task to learn. Default: that of the config file, else walk.
-    #[arg(value_parser = ["walk", "track", "jump", "gait", "attitude", "explore"])]
+    #[arg(value_parser = ["walk", "track", "jump", "gait", "attitude", "explore", "pose"])]
     task: Option<String>,
     /// Folder to write.
     #[arg(long, value_name = "DIR")]
@@ -223,6 +224,9 @@ impl Args {
                 )));
             }
             config.task = TaskConfig::named(task).expect("the argument was checked");
+            if let (TaskConfig::Pose(_), None) = (&config.task, &self.config) {
+                config.sim.physics_hz = None;
+            }
         }
         match (&mut config.task, &self.base) {
             (TaskConfig::Explore(explore), base) => {
@@ -280,8 +284,9 @@ fn open_page(args: &Args, config: &TrainConfig) -> Result<Option<Page>, Failure>
         return Ok(None);
     }
     let mut example = config.envs(1, 1, 1)?.remove(0);
-    let robot = config.robot()?;
-    args.view.open(&format!("twinstep train {}", config.task.name()), example.as_mut(), &robot)
+    let robots = config.robots(1)?;
+    let title = format!("twinstep train {}", config.task.name());
+    args.view.open(example.as_mut(), |scene| robots.scene_info(title, scene))
 }
 
 /// Returns a point of the learning curve as a page shows it.

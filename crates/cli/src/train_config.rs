@@ -3,11 +3,12 @@
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
-use twinstep_env_server::{Config, ConfigFileError, EnvFactory, ServerConfig, SimEnvFactory};
+use twinstep_env_server::{Config, ConfigFileError, EnvFactory, ServerConfig, SimEnvFactory, TreeEnvFactory};
 use twinstep_envs::{Randomisation, TaskConfig};
 use twinstep_learning::PpoConfig;
-use twinstep_model::{AutoresetMode, RobotModel, VecEnv};
+use twinstep_model::{AutoresetMode, RobotModel, Scene, VecEnv};
 use twinstep_sim::{Engine, SimConfig};
+use twinstep_viewer::SceneInfo;
 
 use crate::exit::{Failure, input};
 
@@ -51,7 +52,8 @@ impl TrainConfig {
         let text = std::fs::read_to_string(path)
             .map_err(|source| input(ConfigFileError::Unreadable { path: path.to_owned(), source }))?;
         let mut config = Self::parse(&text, &path.display().to_string())?;
-        if config.sim.engine == Engine::Batch {
+        // The rate was measured with quadrupeds; other robots have the engine's own.
+        if config.sim.engine == Engine::Batch && !matches!(config.task, TaskConfig::Pose(_)) {
             config.sim.physics_hz.get_or_insert(TRAINING_PHYSICS_HZ);
         }
         Ok(config)
@@ -65,12 +67,13 @@ impl TrainConfig {
 
     /// Checks robot, task, simulation and randomisation.
     pub fn check(&self) -> Result<(), Failure> {
-        self.factory(1).map(drop)
+        self.robots(1).map(drop)
     }
 
     /// Builds `groups` batches of environments, `num_envs` in total, that are stepped by `threads` threads each.
     pub fn envs(&self, num_envs: usize, groups: usize, threads: usize) -> Result<Vec<Box<dyn VecEnv>>, Failure> {
-        let factory = self.factory(threads)?;
+        let robots = self.robots(threads)?;
+        let factory = robots.factory();
         (0..groups)
             .map(|group| {
                 let robots = num_envs / groups + usize::from(group < num_envs % groups);
@@ -79,12 +82,21 @@ impl TrainConfig {
             .collect()
     }
 
-    /// Returns the nominal robot, also that of a model file with actuator networks.
-    pub fn robot(&self) -> Result<RobotModel, Failure> {
-        Ok(self.factory(1)?.robot().clone())
+    /// Returns the nominal quadruped, also that of a model file with actuator networks.
+    pub fn quadruped(&self) -> Result<RobotModel, Failure> {
+        Ok(SimEnvFactory::new(self.of_server(1)?).map_err(input)?.robot().clone())
     }
 
-    fn factory(&self, threads: usize) -> Result<SimEnvFactory, Failure> {
+    /// Returns the robots with this number of threads.
+    pub fn robots(&self, threads: usize) -> Result<Robots, Failure> {
+        let config = self.of_server(threads)?;
+        Ok(match config.task {
+            TaskConfig::Pose(_) => Robots::Tree(TreeEnvFactory::new(&config).map_err(input)?),
+            _ => Robots::Quadruped(SimEnvFactory::new(config).map_err(input)?),
+        })
+    }
+
+    fn of_server(&self, threads: usize) -> Result<Config, Failure> {
         let config = Config {
             server: ServerConfig { model: self.model.clone(), ..ServerConfig::default() },
             task: self.task.clone(),
@@ -93,7 +105,33 @@ impl TrainConfig {
             control: None,
         };
         config.check().map_err(input)?;
-        SimEnvFactory::new(config).map_err(input)
+        Ok(config)
+    }
+}
+
+/// Robots that learn.
+pub enum Robots {
+    /// Quadrupeds like the Go2.
+    Quadruped(SimEnvFactory),
+    /// Robots of any tree.
+    Tree(TreeEnvFactory),
+}
+
+impl Robots {
+    /// Returns what builds their environments.
+    pub fn factory(&self) -> &dyn EnvFactory {
+        match self {
+            Self::Quadruped(factory) => factory,
+            Self::Tree(factory) => factory,
+        }
+    }
+
+    /// Describes a scene of one of them.
+    pub fn scene_info(&self, title: impl Into<String>, scene: &Scene) -> SceneInfo {
+        match self {
+            Self::Quadruped(factory) => SceneInfo::new(title, scene, factory.robot()),
+            Self::Tree(factory) => SceneInfo::of_tree(title, scene, factory.tree()),
+        }
     }
 }
 

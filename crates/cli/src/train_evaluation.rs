@@ -8,6 +8,7 @@ use twinstep_sim::{Engine, SimConfig};
 use crate::evaluate_attitude::{self, AttitudeErrors, AttitudeRow};
 use crate::evaluate_jump::{self, JumpRow};
 use crate::evaluate_policy::check_spec;
+use crate::evaluate_pose::{self, PoseErrors};
 use crate::exit::{Failure, Signals, other};
 use crate::train_config::TrainConfig;
 use crate::train_endpoints::remote_env;
@@ -45,6 +46,11 @@ pub fn evaluate_policy(
         let table = evaluate_attitude::table(ROBOTS as u32, SECONDS, &rows);
         return Ok((json(serde_json::to_string_pretty(&rows[0].errors)), text(table)));
     }
+    if let TaskConfig::Pose(_) = &config.task {
+        let errors = pose(policy, config, signals)?;
+        let table = evaluate_pose::table(ROBOTS, SECONDS, &errors);
+        return Ok((json(serde_json::to_string_pretty(&errors)), text(table)));
+    }
     let evaluation = walking(policy, config, endpoints, signals)?;
     Ok((json(serde_json::to_string_pretty(&evaluation)), evaluation_text(&evaluation)))
 }
@@ -56,7 +62,7 @@ fn walking(
     signals: &Signals,
 ) -> Result<Evaluation, Failure> {
     let fresh = fresh(config, config.task.with_default_settings());
-    let robot = fresh.robot()?;
+    let robot = fresh.quadruped()?;
     let plan = EvaluationPlan { robot: &robot, seconds: SECONDS, seed: SEED };
     let proceed = |_: f64| signals.check().is_ok();
     let failure = |error| match error {
@@ -85,7 +91,7 @@ fn jumps(
         let mut env = fresh.envs(ROBOTS, 1, 0)?.remove(0);
         let proceed = |_: f64| signals.check().is_ok();
         check_spec(policy, env.spec())?;
-        let landings = evaluate_jump::evaluate(policy, env.as_mut(), &fresh.robot()?, &task, SEED, proceed);
+        let landings = evaluate_jump::evaluate(policy, env.as_mut(), &fresh.quadruped()?, &task, SEED, proceed);
         targets.push(landings.map_err(other)?.ok_or(Failure::Interrupted)?);
     }
     Ok(targets)
@@ -97,6 +103,13 @@ fn attitude(policy: &Policy, config: &TrainConfig, signals: &Signals) -> Result<
     let proceed = |_: f64| signals.check().is_ok();
     let errors = evaluate_attitude::evaluate(policy, env.as_mut(), (SECONDS, SEED), proceed);
     errors.map_err(other)?.ok_or(Failure::Interrupted)
+}
+
+fn pose(policy: &Policy, config: &TrainConfig, signals: &Signals) -> Result<PoseErrors, Failure> {
+    let mut env = fresh(config, config.task.with_default_settings()).envs(ROBOTS, 1, 0)?.remove(0);
+    check_spec(policy, env.spec())?;
+    let proceed = |_: f64| signals.check().is_ok();
+    evaluate_pose::evaluate(policy, env.as_mut(), (SECONDS, SEED), proceed).map_err(other)?.ok_or(Failure::Interrupted)
 }
 
 /// Returns the training's robot with default physics.

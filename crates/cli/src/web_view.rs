@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use twinstep_env_server::{EnvFactory, EnvFactoryError};
-use twinstep_model::{AutoresetMode, ResetRequest, RobotModel, VecEnv};
+use twinstep_model::{AutoresetMode, ResetRequest, Scene, VecEnv};
 use twinstep_protocol::message::RealTime;
 use twinstep_protocol::random_id;
 use twinstep_viewer::{Hub, SceneInfo, WatchedVecEnv, WebServer};
@@ -61,12 +61,12 @@ impl ViewArgs {
     }
 
     /// Serves the page of robots like that of `env`, which learn, if there is to be one. `env` is reset.
-    pub fn open(&self, title: &str, env: &mut dyn VecEnv, robot: &RobotModel) -> Result<Option<Page>, Failure> {
+    pub fn open(&self, env: &mut dyn VecEnv, info: impl FnOnce(&Scene) -> SceneInfo) -> Result<Option<Page>, Failure> {
         if !self.is_wanted() {
             return Ok(None);
         }
         env.reset(&ResetRequest::default()).map_err(other)?;
-        let scene = SceneInfo::new(title, &env.scene(0).map_err(other)?, robot);
+        let scene = info(&env.scene(0).map_err(other)?);
         let scene = SceneInfo { is_learning: true, ..scene }.with_reward_terms(&env.spec().reward_terms);
         self.serve(&Arc::new(Hub::new(scene)))
     }

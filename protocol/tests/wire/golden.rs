@@ -358,7 +358,7 @@ pub fn small_scene() -> Scene {
         command: Some([1.0, 0.0, -0.5]),
         velocity: None,
         torque: None,
-        foot_force: None,
+        contact_force: None,
         reward_terms: Vec::new(),
         uncertainty: None,
     }
