@@ -32,6 +32,7 @@ mod fuzz;
 mod golden_ensemble;
 mod hunt;
 mod identify;
+mod import;
 mod layering;
 mod learned;
 mod learned_residual;

@@ -43,7 +43,7 @@ pub fn read_contract(path: impl AsRef<Path>) -> Result<ControlTable, AgentError>
                 let file: WithControl = toml::from_str(&text).map_err(|error| failed(error.to_string()))?;
                 return Ok(file.control);
             }
-            of_mapping(&Mapping::parse(&text).map_err(failed)?).map_err(failed)
+            contract_of_mapping(&Mapping::parse(&text).map_err(failed)?).map_err(failed)
         }
         _ => Err(failed("a policy, a mapping or a TOML file with [control] is expected".to_owned())),
     }
@@ -67,7 +67,8 @@ fn of_spec(spec: &EnvSpec) -> Result<ControlTable, String> {
     })
 }
 
-fn of_mapping(mapping: &Mapping) -> Result<ControlTable, String> {
+/// Returns the contract of a mapping as the table `[control]` of a model file.
+pub fn contract_of_mapping(mapping: &Mapping) -> Result<ControlTable, String> {
     let names = mapping.joints.iter().map(|name| name.strip_suffix("_joint").unwrap_or(name));
     let index: BTreeMap<&str, usize> = names.enumerate().map(|(index, name)| (name, index)).collect();
     let mut order = [0; NUM_JOINTS];

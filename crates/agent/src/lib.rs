@@ -25,9 +25,9 @@ mod recorder;
 mod run;
 mod summary;
 
-pub use contract::read_contract;
+pub use contract::{contract_of_mapping, read_contract};
 pub use error::AgentError;
-pub use import::{ImportedPolicy, import_policy};
+pub use import::{Alternative, ImportedPolicy, import_policy};
 pub use joint_recorder::JointRecorder;
 pub use mapping::{History, HistoryLayout, HistoryOrder, InputTable, Mapping, Numbers, StatePair, Term, TermName};
 pub use onnx::{OnnxError, OnnxNetwork, Port};

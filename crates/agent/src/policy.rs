@@ -58,6 +58,11 @@ impl LoadedPolicy {
         }
     }
 
+    /// Returns the policy of a network of another program.
+    pub fn mapped(network: OnnxNetwork, mapping: Mapping) -> Self {
+        Self(Source::Mapped(network, Box::new(mapping)))
+    }
+
     /// Returns the spec that the policy was trained for. `None`: the file of another program has none.
     pub fn spec(&self) -> Option<&EnvSpec> {
         match &self.0 {

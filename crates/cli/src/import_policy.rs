@@ -2,14 +2,20 @@
 
 use std::path::PathBuf;
 
-use crate::exit::{CommandResult, Failure, input};
 use twinstep_agent::{ImportedPolicy, import_policy};
+
+use crate::exit::{CommandResult, Failure, input};
+use crate::rehearsal::Rehearsal;
 
 /// Make the mapping of a policy of another program from the files that its training left.
 ///
 /// SOURCE is a file or a folder with: deploy.yaml of unitree_rl_lab or unitree_rl_mjlab, env.yaml and agent.yaml of Isaac Lab,
-/// config.yaml of rl_sar, the config of legged_gym or HIMLoco (*.py), or a network with metadata of mjlab (*.onnx). With the
-/// network among them, the sizes are compared too.
+/// config.yaml of rl_sar, a config of unitree_rl_gym (*.yaml), that of legged_gym or HIMLoco (*.py), or a network with metadata
+/// of mjlab (*.onnx). With the network among them, the sizes are compared too.
+///
+/// A complete mapping with its network is rehearsed: a simulated Go2 is commanded forward, then to turn. If no config contains
+/// the order of the observation, that of the program is tried, then the others, and the first with which the robot does what is
+/// commanded is written.
 ///
 /// It says for every entry where its value comes from, what it assumed, where sources do not agree, and
 /// what it could not find. The exit code is 1 if something is missing; the mapping then has a comment in its place.
@@ -28,23 +34,51 @@ pub struct Args {
 
 /// Makes the mapping and says where its entries come from.
 pub fn run(args: &Args) -> CommandResult {
-    let imported = import_policy(&args.source).map_err(input)?;
+    let existing = args.out.as_ref().filter(|path| path.exists());
+    if let Some(path) = existing {
+        return Err(Failure::Input(miette::miette!("`--out` = {} exists already", path.display())));
+    }
+    let mut imported = import_policy(&args.source).map_err(input)?;
+    let rehearsed = rehearse(&mut imported);
     match &args.out {
         Some(path) => {
-            if path.exists() {
-                return Err(Failure::Input(miette::miette!("`--out` = {} exists already", path.display())));
-            }
             twinstep_files::write(path, &imported.mapping).map_err(input)?;
             eprintln!("{}", path.display());
         }
         None => print!("{}", imported.mapping),
     }
-    eprint!("{}", report(&imported));
+    eprint!("{}{rehearsed}", report(&imported));
     if imported.missing.is_empty() {
         return Ok(());
     }
     let count = imported.missing.len();
     Err(Failure::Other(miette::miette!("the mapping lacks {count} entries: fill them in where it says `not found`")))
+}
+
+/// Rehearses a complete mapping, and other orders of its observation if no source contains the order. Returns what happened.
+fn rehearse(imported: &mut ImportedPolicy) -> String {
+    let Some(network) = imported.network.clone().filter(|_| imported.missing.is_empty()) else { return String::new() };
+    let first = match Rehearsal::of(&network, &imported.mapping) {
+        Ok(first) => first,
+        Err(reason) => return format!("rehearsed     no: {reason}\n"),
+    };
+    if first.walks() || imported.alternatives.is_empty() {
+        return format!("rehearsed     {first}\n");
+    }
+    for (tried, alternative) in imported.alternatives.iter().enumerate() {
+        let Some(other) = Rehearsal::of(&network, &alternative.mapping).ok().filter(Rehearsal::walks) else { continue };
+        let text = format!(
+            "rehearsed     {first}\ntaken instead: {}, the first of {} other orders with which the robot walks: {other}\n",
+            alternative.order,
+            tried + 1
+        );
+        imported.mapping.clone_from(&alternative.mapping);
+        return text;
+    }
+    let count = imported.alternatives.len();
+    format!(
+        "rehearsed     {first}\n              with none of {count} other orders of the observation the robot walks\n"
+    )
 }
 
 fn report(imported: &ImportedPolicy) -> String {

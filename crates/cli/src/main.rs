@@ -39,6 +39,7 @@ mod play;
 mod player;
 mod preflight;
 mod random_commands;
+mod rehearsal;
 mod robot;
 mod robot_env_factory;
 mod robot_file;

@@ -90,6 +90,8 @@ pub struct Facts {
     pub action_clip: Option<Found<[f64; 2]>>,
     /// The observation.
     pub observation: Option<Found<InputFacts>>,
+    /// True if the source does not contain the order of the observation's terms.
+    pub is_order_assumed: bool,
     /// Further inputs by name.
     pub inputs: BTreeMap<String, InputFacts>,
     /// What a reader should know.

@@ -89,6 +89,7 @@ fn observation(facts: &mut Facts, number: &dyn Fn(&str) -> Option<f64>, step: Op
         order.description()
     ));
     facts.observation = Some(facts.found(input, "number of observations"));
+    facts.is_order_assumed = true;
 }
 
 /// Order of the terms in an observation, which no config of this family contains: each program has one, and a length.

@@ -22,6 +22,8 @@ pub struct Draft {
     pub action_clip: Option<[f64; 2]>,
     /// The observation.
     pub observation: Option<InputFacts>,
+    /// True if no source contains the order of the observation's terms.
+    pub is_order_assumed: bool,
     /// Further inputs of the network.
     pub inputs: BTreeMap<String, InputFacts>,
     /// As in `ImportedPolicy`.
@@ -77,6 +79,8 @@ impl Draft {
         if let Some(network) = network {
             draft.compare(network);
         }
+        let of_observation = sources.iter().find(|facts| facts.observation.is_some());
+        draft.is_order_assumed = of_observation.is_some_and(|facts| facts.is_order_assumed);
         draft
     }
 

@@ -10,6 +10,7 @@ mod isaac_lab;
 mod legged_gym;
 mod merge;
 mod metadata;
+mod orders;
 mod rl_gym;
 mod rl_sar;
 mod sources;
@@ -37,6 +38,17 @@ pub struct ImportedPolicy {
     pub disagreements: Vec<String>,
     /// What was taken without being said by a source.
     pub notes: Vec<String>,
+    /// The mapping with every other order of the observation, if no source contains the order.
+    pub alternatives: Vec<Alternative>,
+}
+
+/// Another mapping that the sources allow.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Alternative {
+    /// Order of the observation.
+    pub order: String,
+    /// Text of the mapping file.
+    pub mapping: String,
 }
 
 /// Makes a mapping from files, or from folders that contain them.
@@ -45,9 +57,11 @@ pub fn import_policy(paths: &[impl AsRef<Path>]) -> Result<ImportedPolicy, Agent
     let facts = sources.facts()?;
     let draft = Draft::new(facts, sources.network.as_ref());
     let mapping = text::mapping(&draft);
+    let others = orders::other_orders(&draft).into_iter();
+    let alternatives = others.map(|(order, draft)| Alternative { order, mapping: text::mapping(&draft) }).collect();
     let Draft { origins, missing, disagreements, notes, .. } = draft;
     let network = sources.network.map(|network| network.path().to_owned());
-    Ok(ImportedPolicy { mapping, network, origins, missing, disagreements, notes })
+    Ok(ImportedPolicy { mapping, network, origins, missing, disagreements, notes, alternatives })
 }
 
 #[cfg(test)]

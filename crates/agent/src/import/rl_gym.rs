@@ -43,6 +43,7 @@ pub fn read(source: &str, yaml: &Yaml, inputs: Option<usize>) -> Result<Facts, S
             let history = history(if is_stacked { steps } else { 1 }, HistoryLayout::Frames, HistoryOrder::OldestFirst);
             let input = InputFacts { terms: order.terms(&scale, command), unknown: Vec::new(), history };
             facts.observation = Some(facts.found(input, "number of observations"));
+            facts.is_order_assumed = true;
             facts.notes.push(format!(
                 "the config does not contain the order of the observation: {} is taken; compare it with the program that runs the policy",
                 order.description()
