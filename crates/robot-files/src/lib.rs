@@ -9,6 +9,7 @@
 //!
 //! What "as MuJoCo does" means is measured, not claimed: the test `test_robot_files.py` compares compiled models.
 
+mod collada;
 mod error;
 mod include;
 mod inertia;

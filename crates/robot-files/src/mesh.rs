@@ -1,10 +1,12 @@
-//! Bounds of meshes that lie beside a robot file. Other formats than STL and OBJ are not read.
+//! Bounds of meshes that lie beside a robot file. Other formats than STL, OBJ and COLLADA are not read.
 
 use std::cell::{Cell, RefCell};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use glam::DVec3;
+
+use crate::collada;
 
 /// Maximum size of all mesh files of a robot [bytes].
 const MAX_BYTES: u64 = 256 << 20;
@@ -51,13 +53,18 @@ impl MeshFolder {
         let vertices = match end.as_str() {
             "stl" => stl(&bytes),
             "obj" => words(std::str::from_utf8(&bytes).ok()?, "v"),
+            "dae" => return collada::bounds(std::str::from_utf8(&bytes).ok()?).filter(is_finite),
             _ => return None,
         };
         let mut vertices = vertices.into_iter();
         let first = vertices.next()?;
         let [low, high] = vertices.fold([first; 2], |[low, high], vertex| [low.min(vertex), high.max(vertex)]);
-        (low.is_finite() && high.is_finite()).then_some([low, high])
+        Some([low, high]).filter(is_finite)
     }
+}
+
+fn is_finite(bounds: &Bounds) -> bool {
+    bounds.iter().all(|corner| corner.is_finite())
 }
 
 fn find(folder: &Path, file: &str) -> Option<PathBuf> {
