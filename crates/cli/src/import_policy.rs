@@ -14,8 +14,8 @@ use crate::rehearsal::Rehearsal;
 /// of mjlab (*.onnx). With the network among them, the sizes are compared too.
 ///
 /// A complete mapping with its network is rehearsed: a simulated Go2 is commanded forward, then to turn. If no config contains
-/// the order of the observation, that of the program is tried, then the others, and the first with which the robot does what is
-/// commanded is written.
+/// the order of the observation, that of the program is tried. If the robot does not walk with it, the others are tried, and the
+/// best of them is written.
 ///
 /// It says for every entry where its value comes from, what it assumed, where sources do not agree, and
 /// what it could not find. The exit code is 1 if something is missing; the mapping then has a comment in its place.
@@ -65,20 +65,24 @@ fn rehearse(imported: &mut ImportedPolicy) -> String {
     if first.walks() || imported.alternatives.is_empty() {
         return format!("rehearsed     {first}\n");
     }
-    for (tried, alternative) in imported.alternatives.iter().enumerate() {
-        let Some(other) = Rehearsal::of(&network, &alternative.mapping).ok().filter(Rehearsal::walks) else { continue };
-        let text = format!(
-            "rehearsed     {first}\ntaken instead: {}, the first of {} other orders with which the robot walks: {other}\n",
-            alternative.order,
-            tried + 1
-        );
-        imported.mapping.clone_from(&alternative.mapping);
-        return text;
-    }
+    let rehearsed = imported.alternatives.iter().filter_map(|alternative| {
+        let rehearsal = Rehearsal::of(&network, &alternative.mapping).ok().filter(Rehearsal::walks)?;
+        Some((alternative.clone(), rehearsal))
+    });
+    let mut walking: Vec<_> = rehearsed.collect();
+    walking.sort_by(|(_, one), (_, other)| one.error().total_cmp(&other.error()));
     let count = imported.alternatives.len();
-    format!(
-        "rehearsed     {first}\n              with none of {count} other orders of the observation the robot walks\n"
-    )
+    let Some((best, rehearsal)) = walking.first() else {
+        return format!(
+            "rehearsed     {first}\n              with none of {count} other orders of the observation the robot walks\n"
+        );
+    };
+    imported.mapping.clone_from(&best.mapping);
+    let others = match walking.len() {
+        1 => format!("the only one of {count} other orders with which the robot walks"),
+        walking => format!("the best of {walking} with which the robot walks, of {count} other orders"),
+    };
+    format!("rehearsed     {first}\ntaken instead: {}, {others}: {rehearsal}\n", best.order)
 }
 
 fn report(imported: &ImportedPolicy) -> String {

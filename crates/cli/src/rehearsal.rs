@@ -25,6 +25,8 @@ pub struct Rehearsal {
     forward: f64,
     /// Mean yaw rate under a command to turn [rad/s].
     turn: f64,
+    /// Root mean square errors of the horizontal velocity [m/s] and the yaw rate [rad/s] under both commands, added up.
+    error: f64,
     /// Number of falls.
     falls: u64,
     /// Share of the entries of actions that were clipped.
@@ -56,9 +58,15 @@ impl Rehearsal {
         Ok(Self {
             forward: forward.mean_velocity.map_or(f64::NAN, |velocity| velocity[0]),
             turn: turn.mean_velocity.map_or(f64::NAN, |velocity| velocity[2]),
+            error: [&forward, &turn].iter().flat_map(|one| [one.velocity_rms, one.yaw_rate_rms]).flatten().sum(),
             falls: forward.falls + turn.falls,
             clipped: f64::midpoint(forward.clipped_share, turn.clipped_share),
         })
+    }
+
+    /// Returns the size of the errors.
+    pub fn error(&self) -> f64 {
+        self.error
     }
 
     /// Returns true if the robot does what is commanded.
@@ -70,7 +78,7 @@ impl Rehearsal {
 
 impl std::fmt::Display for Rehearsal {
     fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { forward, turn, falls, clipped } = self;
+        let Self { forward, turn, falls, clipped, .. } = self;
         let falls = match falls {
             0 => "no fall".to_owned(),
             1 => "1 fall".to_owned(),

@@ -92,9 +92,12 @@ impl Sources {
             let yaml = Yaml::parse(&content).map_err(|reason| failed(path, &format!("it is not YAML: {reason}")))?;
             if yaml.get("joint_ids_map").is_some() {
                 all.push((0, deploy_yaml::read(name, &yaml).map_err(error)?));
-            } else if yaml.get("scene").is_some() && yaml.get("actions").is_some() {
+            } else if is_isaac_lab(&yaml) {
                 let agent = beside(path, "agent.yaml")?;
                 all.push((1, isaac_lab::read(name, &yaml, agent.as_ref()).map_err(error)?));
+            } else if let Some(env) = yaml.get("env").filter(|env| is_isaac_lab(env)) {
+                // Hydra keeps both in one file.
+                all.push((1, isaac_lab::read(name, env, yaml.get("agent")).map_err(error)?));
             } else if has(&yaml, "observations") && has(&yaml, "rl_kp") {
                 let base =
                     beside(path, "base.yaml")?.map_or_else(|| beside(path, "../base.yaml"), |base| Ok(Some(base)))?;
@@ -126,6 +129,10 @@ impl Sources {
         }
         Ok(all.into_iter().map(|(_, facts)| facts).collect())
     }
+}
+
+fn is_isaac_lab(yaml: &Yaml) -> bool {
+    yaml.get("scene").is_some() && yaml.get("actions").is_some()
 }
 
 /// The settings may be below one name.
