@@ -62,8 +62,13 @@ fn rehearse(imported: &mut ImportedPolicy) -> String {
         Ok(first) => first,
         Err(reason) => return format!("rehearsed     no: {reason}\n"),
     };
-    if first.walks() || imported.alternatives.is_empty() {
+    if first.walks() {
         return format!("rehearsed     {first}\n");
+    }
+    if imported.alternatives.is_empty() {
+        return format!(
+            "rehearsed     {first}\n              it does not do what is commanded: compare the mapping with the program that trained it\n"
+        );
     }
     let rehearsed = imported.alternatives.iter().filter_map(|alternative| {
         let rehearsal = Rehearsal::of(&network, &alternative.mapping).ok().filter(Rehearsal::walks)?;
