@@ -261,7 +261,11 @@ pub fn task_spec(config: &TaskConfig, robot: &RobotModel, has_ground_truth: bool
 pub fn check_measurable(config: &TaskConfig) -> Result<(), EnvFactoryError> {
     let reason = match config {
         TaskConfig::Walk(_) | TaskConfig::Gait(_) | TaskConfig::Jump(_) | TaskConfig::Attitude(_) => return Ok(()),
-        TaskConfig::Track(_) => "it observes its position on the path, which no sensor of the robot measures",
+        // Without motion capture the policy follows the velocity of the path alone.
+        TaskConfig::Track(track) if !track.observe_pose_error => return Ok(()),
+        TaskConfig::Track(_) => {
+            "it observes its position on the path, which no sensor of the robot measures: set `observe_pose_error = false`"
+        }
         TaskConfig::Explore(_) => "its reward needs actuator networks; run the policy that it trained as `walk`",
         TaskConfig::Pose(_) => "it is for simulated robots of any shape",
         TaskConfig::Counter => "it has no robot",

@@ -100,5 +100,30 @@ fn contract_outside_the_safety_limits_does_not_start() {
     std::fs::write(&path, "[task]\nname = \"track\"\n").unwrap();
     let refused = twinstep(&["robot", "--fake", "--config", path.to_str().unwrap()]);
     let error = String::from_utf8_lossy(&refused.stderr).into_owned();
-    assert!(error.contains("\"track\" is not possible on a robot"), "{error}");
+    assert!(error.contains("\"track\" is not possible on a robot") && error.contains("observe_pose_error"), "{error}");
+}
+
+#[test]
+fn path_is_followed_on_a_robot_without_motion_capture() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("circle.toml");
+    let task =
+        "[task]\nname = \"track\"\npath = \"circle\"\nradius_m = 0.75\nspeed = 0.4\nobserve_pose_error = false\n";
+    std::fs::write(&path, task).unwrap();
+    let policy = root().join("data/policies/track.safetensors");
+    test_in_real_time(|| {
+        let mut pair = standing(&["--config", path.to_str().unwrap()]);
+        let start = pair.ask("pose").unwrap();
+        // Half of the circle: from the right side to the left one.
+        let seconds = std::f64::consts::PI * 0.75 / 0.4;
+        let options = ["--endpoint", &pair.endpoint, "--seconds", &format!("{seconds:.2}")];
+        let walked = twinstep(&[&["run", policy.to_str().unwrap()], &options[..]].concat());
+        assert!(walked.status.success(), "{}", String::from_utf8_lossy(&walked.stderr));
+        let end = pair.ask("pose").unwrap();
+        let moved =
+            [0, 1].map(|axis| end["position"][axis].as_f64().unwrap() - start["position"][axis].as_f64().unwrap());
+        let distance = moved[0].hypot(moved[1]);
+        // The diameter, within the drift of a robot that does not know where it is.
+        assert!((0.9..2.1).contains(&distance), "{moved:?} m");
+    });
 }

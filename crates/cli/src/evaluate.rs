@@ -32,7 +32,7 @@ use twinstep_report::{chart, evaluation_plot};
 pub struct Args {
     /// Measured log: a data file, or a folder that contains one.
     log: PathBuf,
-    /// Model file of the robot. Default: the ideal Go2.
+    /// Model file of the robot, or the name of one in this program, such as spot (docs/robots.md). Default: the ideal Go2.
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
     #[command(flatten)]

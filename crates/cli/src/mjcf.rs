@@ -9,6 +9,7 @@ use twinstep_robot_files::{QuadrupedNames, TreeMjcf, quadruped, read_robot, writ
 
 use crate::exit::{CommandResult, Failure, input, other};
 use crate::robot_file::robot_model;
+use crate::tree_model::of_any_tree;
 
 /// Allowed time steps [s].
 const TIMESTEPS: std::ops::RangeInclusive<f64> = 1e-5..=0.02;
@@ -24,7 +25,7 @@ const TIMESTEPS: std::ops::RangeInclusive<f64> = 1e-5..=0.02;
 /// Example: `twinstep mjcf --out go2.xml && python -m mujoco.viewer --mjcf go2.xml`
 #[derive(clap::Args)]
 pub struct Args {
-    /// Model file of the robot. Default: the ideal Go2.
+    /// Model file of the robot, or the name of one in this program, such as spot (docs/robots.md). Default: the ideal Go2.
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
     /// Mounting of the base: floating, or fixed; that of the Go2 1 m above the ground. A file can fix it, too.
@@ -67,7 +68,7 @@ pub fn run(args: &Args) -> CommandResult {
     let options = MjcfOptions { base: args.base, timestep: args.timestep, ..MjcfOptions::default() };
     let text = match args.model.as_deref().filter(|path| is_robot_file(path)) {
         Some(path) => of_robot_file(path, &options)?,
-        None => mjcf(&robot_model(args.model.as_deref())?, &options),
+        None => of_model_file(args.model.as_deref(), &options)?,
     };
     match &args.out {
         Some(path) => {
@@ -75,6 +76,16 @@ pub fn run(args: &Args) -> CommandResult {
         }
         None => std::io::stdout().write_all(text.as_bytes()).map_err(other),
     }
+}
+
+/// Returns the model of a model file; as a tree if it is no quadruped like the Go2.
+fn of_model_file(path: Option<&Path>, options: &MjcfOptions) -> Result<String, Failure> {
+    let refused = match robot_model(path) {
+        Ok(robot) => return Ok(mjcf(&robot, options)),
+        Err(refused) => refused,
+    };
+    let tree = of_any_tree(path).ok().and_then(|file| file.tree_model().ok()).ok_or(refused)?.tree;
+    Ok(write_mjcf(&tree, &TreeMjcf { timestep: options.timestep, ..TreeMjcf::default() }))
 }
 
 /// Returns the model of a robot file, as a tree if it has not the shape of the Go2. Prints what the file has and the model does not.

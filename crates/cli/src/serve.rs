@@ -47,7 +47,7 @@ pub struct Args {
     /// Default: 4096.
     #[arg(long, value_name = "N")]
     envs: Option<usize>,
-    /// Model file of the robot. Default: the ideal Go2.
+    /// Model file of the robot, or the name of one in this program, such as spot (docs/robots.md). Default: the ideal Go2.
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
     /// Zenoh endpoint to listen on; port 0 selects a free port. Default: tcp/127.0.0.1:7447.

@@ -53,7 +53,7 @@ pub struct Args {
     /// Config file (TOML) with [task], [sim], [randomise] and [train]. Flags override its values.
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// Model file of the robot. Default: the ideal Go2.
+    /// Model file of the robot, or the name of one in this program, such as spot (docs/robots.md). Default: the ideal Go2.
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
     /// Sample every parameter of the model file that has an interval, for every robot in every episode.

@@ -20,7 +20,7 @@ use crate::{view_endpoint, view_log, view_policy, view_tree};
 /// once per segment with a fixed one. The curves are the errors joint by joint. A log of another robot than a quadruped like
 /// the Go2 is shown with the shapes of its --model (URDF, MJCF or a model file), without a ghost.
 ///
-/// ROBOT (*.urdf, *.xml, or a model file *.toml): its joints move one after the other through their ranges.
+/// ROBOT (*.urdf, *.xml, a model file *.toml, or a name such as g1): its joints move one after the other through their ranges.
 ///
 /// ENDPOINT (tcp/HOST:PORT, also tls, quic): the robots that step at a server (the newest lease, up to 64 robots), or the
 /// robot of `twinstep robot`. They are looked at only, and without an open page the server draws nothing.
@@ -80,7 +80,7 @@ struct NoTarget(String);
 pub fn run(args: &Args) -> CommandResult {
     let signals = Signals::listen()?;
     let path = Path::new(&args.target);
-    if !path.exists() {
+    if !path.exists() && !view_tree::is_robot(path) {
         if !view_endpoint::is_endpoint(&args.target) {
             return Err(input(NoTarget(args.target.clone())));
         }

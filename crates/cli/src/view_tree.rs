@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use glam::{DAffine3, DQuat, DVec3};
-use twinstep_effects::TreeModelFile;
+use twinstep_effects::{TreeModelFile, shipped_robots};
 use twinstep_logs::Log;
 use twinstep_model::{BaseMount, Ground, RobotTree, Scene, TreeJointKind, TreeModel};
 use twinstep_viewer::{Frame, RobotFrame, SceneInfo};
@@ -21,9 +21,11 @@ const SWEEP_HZ: f64 = 60.0;
 /// Largest motion of a joint to either side [rad or m]: a wheel has no range.
 const MAX_SWEEP: f64 = std::f64::consts::PI;
 
-/// Returns true for a robot file or a model file.
+/// Returns true for a robot file, a model file, or the name of a robot in this program.
 pub fn is_robot(path: &Path) -> bool {
-    path.extension().is_some_and(|end| ["urdf", "xml", "mjcf", "toml"].iter().any(|known| end == *known))
+    let is_shipped = || shipped_robots().any(|name| Path::new(name) == path);
+    (!path.exists() && is_shipped())
+        || path.extension().is_some_and(|end| ["urdf", "xml", "mjcf", "toml"].iter().any(|known| end == *known))
 }
 
 /// Shows the robot of a file until a signal.

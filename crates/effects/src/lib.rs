@@ -21,6 +21,7 @@ mod nominal;
 mod sampler;
 mod scope;
 mod search;
+mod shipped_robots;
 
 pub use catalogue::CATALOGUE;
 pub use data_requirement::{DataRequirement, LOW_SPEED};
@@ -35,6 +36,7 @@ pub use sampler::{RobotSampler, SamplingError};
 pub use scope::{Scope, UnknownScope};
 pub use search::{BlindTestCondition, Probes, Search, Variable, Visibility};
 use search::{probes_along_axes, probes_over};
+pub use shipped_robots::shipped_robots;
 
 use twinstep_model::{JointModel, RobotModel};
 

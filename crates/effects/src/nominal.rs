@@ -1,6 +1,7 @@
 //! The nominal robot of a model file: the built-in Go2, or a URDF or MJCF file with its tables `[control]` and
 //! `[joints]`.
 
+use crate::shipped_robots::read_to_string;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
@@ -169,8 +170,8 @@ impl NominalRobot {
         let path = folder.join(robot);
         // Absolute, so that the model is still valid after a tool writes it to another folder.
         let path = std::path::absolute(&path).unwrap_or(path);
-        let text = std::fs::read_to_string(&path)
-            .map_err(|source| NominalRobotError::Unreadable { path: path.clone(), source })?;
+        let text =
+            read_to_string(&path).map_err(|source| NominalRobotError::Unreadable { path: path.clone(), source })?;
         let JointsTable { names, feet } = joints.clone().unwrap_or_default();
         let config = table.config(names.is_none())?;
         let (model, notes) = read_robot(&text, path.parent())

@@ -9,7 +9,7 @@ use crate::{CATALOGUE, Effect, EntryError};
 #[derive(Debug, thiserror::Error)]
 pub enum ModelFileError {
     /// The file could not be read.
-    #[error("cannot read the model file {}: {source}", path.display())]
+    #[error("cannot read the model file {}: {source}{}", path.display(), shipped(path))]
     Unreadable {
         /// The file.
         path: PathBuf,
@@ -106,4 +106,13 @@ pub enum EffectEntryError {
 fn names(effect: &str) -> String {
     let parameters = Effect::named(effect).map_or(&[][..], |effect| effect.parameters);
     parameters.iter().map(|parameter| parameter.name).collect::<Vec<_>>().join(", ")
+}
+
+/// Names the robots of the program if a name may be meant.
+fn shipped(path: &std::path::Path) -> String {
+    if path.extension().is_some() {
+        return String::new();
+    }
+    let names: Vec<_> = crate::shipped_robots().collect();
+    format!("\n  robots of this program, without a file: {}", names.join(", "))
 }

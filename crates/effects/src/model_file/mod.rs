@@ -23,6 +23,7 @@ pub use error::{EffectEntryError, ModelFileError};
 pub use tree::{JointEffect, JointScope, NominalGain, TreeModelFile};
 
 use crate::nominal::{ControlTable, JointsTable, NominalRobot, NominalRobotError, is_robot_file};
+use crate::shipped_robots::{read_to_string, resolved};
 use crate::{EffectEntry, EntryError, apply_effects};
 use actuator_network::write_actuator_network;
 use effect_table::{read_entry, write_entry};
@@ -59,12 +60,12 @@ impl Default for ModelFile {
 impl ModelFile {
     /// Reads a model file, or a robot file (URDF, MJCF) as a model without effects. Paths in it become absolute.
     pub fn load(path: impl AsRef<Path>) -> Result<Self, ModelFileError> {
-        let path = path.as_ref();
+        let path = &*resolved(path.as_ref());
         if is_robot_file(path) {
             return Self::parse(&format!("robot = {}", Value::from(path.display().to_string())), "`--model`");
         }
-        let text = std::fs::read_to_string(path)
-            .map_err(|source| ModelFileError::Unreadable { path: path.to_owned(), source })?;
+        let text =
+            read_to_string(path).map_err(|source| ModelFileError::Unreadable { path: path.to_owned(), source })?;
         let unreadable = |source| ModelFileError::Unreadable { path: path.to_owned(), source };
         let folder = path.parent().unwrap_or(Path::new(""));
         let mut file = Self::parse_in(folder, &text, &path.display().to_string())?;

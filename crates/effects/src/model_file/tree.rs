@@ -12,6 +12,7 @@ use twinstep_robot_files::read_robot;
 use super::effect_table::{EffectTable, key_error, read_table, write_table};
 use super::error::{EffectEntryError, ModelFileError};
 use crate::nominal::{BUILT_IN, JointsTable, NominalRobotError, is_robot_file};
+use crate::shipped_robots::{read_to_string, resolved};
 use crate::{Apply, CATALOGUE, Effect};
 
 /// A robot of any tree, and the effects at its joints.
@@ -183,12 +184,12 @@ impl TreeModelFile {
 
     /// Reads a model file, or a robot file (URDF, MJCF) as a model without effects. Paths in it become absolute.
     pub fn load(path: impl AsRef<Path>) -> Result<Self, ModelFileError> {
-        let path = path.as_ref();
+        let path = &*resolved(path.as_ref());
         if is_robot_file(path) {
             return Self::parse(&format!("robot = {}", Value::from(path.display().to_string())), "`--model`");
         }
-        let text = std::fs::read_to_string(path)
-            .map_err(|source| ModelFileError::Unreadable { path: path.to_owned(), source })?;
+        let text =
+            read_to_string(path).map_err(|source| ModelFileError::Unreadable { path: path.to_owned(), source })?;
         Self::parse_in(path.parent().unwrap_or(Path::new("")), &text, &path.display().to_string())
     }
 
@@ -240,7 +241,7 @@ impl TreeModelFile {
         }
         let path = folder.join(robot);
         let path = std::path::absolute(&path).unwrap_or(path);
-        let text = std::fs::read_to_string(&path)
+        let text = read_to_string(&path)
             .map_err(|source| refused(NominalRobotError::Unreadable { path: path.clone(), source }))?;
         let file = read_robot(&text, path.parent())
             .map_err(|cause| refused(NominalRobotError::Import { path: path.clone(), cause }))?;
