@@ -47,12 +47,14 @@ fn joints_of_a_robot_file_and_of_a_log_move_on_a_page() {
     };
     let page = scene(&robot("g1.xml"), &[]);
     assert!(page.contains("left_hip_pitch_joint") && page.contains("torque_limits"), "the joints of the G1");
-    let mut rows = "t,q_shoulder_pan,q_gripper\n".to_owned();
+    let mut rows = "t,q_shoulder_pan,q_cmd_shoulder_pan\n".to_owned();
     rows.extend((0..200).map(|row| {
         let t = 0.02 * f64::from(row);
-        format!("{t},{},0.3\n", 0.4 * t.sin())
+        format!("{t},{},{}\n", 0.4 * t.sin(), 0.41 * t.sin())
     }));
     std::fs::write(folder.path().join("arm.csv"), rows).unwrap();
+    let meta = r#"{"rate_hz": 50, "tau_sensor": "none", "segments": [{"name": "wave", "base": "fixed"}]}"#;
+    std::fs::write(folder.path().join("arm.json"), meta).unwrap();
     let page = scene("arm.csv", &["--model", &robot("so101.toml")]);
     assert!(page.contains("shoulder_pan") && !page.contains("FL_hip"), "the joints of the arm");
 }

@@ -6,7 +6,9 @@ use std::process::{Command, Output};
 use twinstep_agent::Mapping;
 use twinstep_policy::Policy;
 use twinstep_tests::foreign_policy::foreign_policy;
+use twinstep_tests::process::Process;
 use twinstep_tests::python::root;
+use twinstep_tests::robot_pair::{PATIENT, RobotPair, next_domain};
 
 use crate::robot::{program, standing, test_in_real_time};
 
@@ -65,9 +67,7 @@ fn policy_of_another_program_walks_the_robot_whose_endpoint_has_its_contract() {
     let [policy, mapping] = written(folder.path());
     test_in_real_time(|| {
         let mut pair = standing(&["--contract", &mapping]);
-        let place = |pair: &mut twinstep_tests::robot_pair::RobotPair| {
-            pair.ask("pose").unwrap()["position"][0].as_f64().unwrap()
-        };
+        let place = |pair: &mut RobotPair| pair.ask("pose").unwrap()["position"][0].as_f64().unwrap();
         let start = place(&mut pair);
         let run = |policy: &[&str]| {
             let options = ["--endpoint", &pair.endpoint, "--velocity", "0.5,0,0", "--seconds", "6"];
@@ -105,14 +105,17 @@ fn contract_outside_the_safety_limits_does_not_start() {
 
 #[test]
 fn path_is_followed_on_a_robot_without_motion_capture() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("circle.toml");
     let task =
         "[task]\nname = \"track\"\npath = \"circle\"\nradius_m = 0.75\nspeed = 0.4\nobserve_pose_error = false\n";
-    std::fs::write(&path, task).unwrap();
     let policy = root().join("data/policies/track.safetensors");
     test_in_real_time(|| {
-        let mut pair = standing(&["--config", path.to_str().unwrap()]);
+        let domain = next_domain().to_string();
+        let fake = ["fake-robot", "--until-stdin-closes", "--domain", &domain].map(str::to_owned);
+        let fake = Process::start(&program(), &fake).unwrap();
+        let config = format!("{PATIENT}{task}");
+        let domain = domain.parse().unwrap();
+        let mut pair = RobotPair::in_front_of(fake, domain, &config, &program(), &[]).unwrap();
+        pair.stand().unwrap();
         let start = pair.ask("pose").unwrap();
         // Half of the circle: from the right side to the left one.
         let seconds = std::f64::consts::PI * 0.75 / 0.4;

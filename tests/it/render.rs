@@ -32,9 +32,9 @@ fn remote_and_local_scenes_are_equal_and_rendering_does_not_change_the_episode()
         for env in 0..2 {
             // What a server does not send is known in process only.
             let local = local.scene(env).unwrap();
-            assert!(local.velocity.is_some() && local.torque.is_some() && local.foot_force.is_some());
+            assert!(local.velocity.is_some() && local.torque.is_some() && local.contact_force.is_some());
             assert!(!local.reward_terms.is_empty());
-            let sent = Scene { velocity: None, torque: None, foot_force: None, reward_terms: Vec::new(), ..local };
+            let sent = Scene { velocity: None, torque: None, contact_force: None, reward_terms: Vec::new(), ..local };
             assert_eq!(remote.scene(env).unwrap(), sent, "step {step}, environment {env}");
         }
         let actions: Vec<f32> = (0..24).map(|index| ((step * 7 + index) as f32).sin()).collect();

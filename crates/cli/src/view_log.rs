@@ -13,7 +13,7 @@ use crate::open_log::open_log;
 use crate::player::{Curves, Player};
 use crate::robot_file::SimulatedRobot;
 use crate::tree_model::tree_model;
-use crate::view_tree;
+use crate::view_tree::{self, measured_torque};
 use crate::web_view::PageArgs;
 
 /// Plays a log until a signal.
@@ -120,7 +120,7 @@ struct Motion {
 impl Motion {
     fn at(&self, row: usize) -> (RobotFrame, Curves) {
         let measured = self.measured[row];
-        let torque = torque(&self.log, &Joint::ALL.map(Joint::name), row);
+        let torque = measured_torque(&self.log, &Joint::ALL.map(Joint::name), row);
         let mut robot = RobotFrame { torque, ..RobotFrame::of_scene(&measured.scene(&self.robot)) };
         let mut curves = Vec::new();
         if self.simulated.is_empty() {
@@ -139,9 +139,4 @@ impl Motion {
         }
         (robot, curves)
     }
-}
-
-/// Returns the measured torques of a row, if those of all joints were measured.
-pub fn torque(log: &Log, joints: &[&str], row: usize) -> Option<Vec<f32>> {
-    joints.iter().map(|joint| log.tau_measured(joint).map(|column| column[row] as f32)).collect()
 }

@@ -11,7 +11,6 @@ use twinstep_viewer::{Frame, RobotFrame, SceneInfo};
 use crate::exit::{CommandResult, Failure, Signals};
 use crate::player::{Curves, Player};
 use crate::tree_model::of_any_tree;
-use crate::view_log::torque;
 use crate::web_view::PageArgs;
 
 /// Time in which a joint moves from the default pose to both ends of its range and back [s].
@@ -82,9 +81,14 @@ pub fn log(log: &Log, path: &Path, file: &TreeModelFile) -> Result<(Player, Scen
         let (base, q) = &poses[row];
         let names: Vec<&str> = tree.joints.iter().map(|joint| joint.name.as_str()).collect();
         let scene = Scene::of_tree(&tree, *base, q, &Ground::FLAT);
-        (RobotFrame { torque: torque(&log, &names, row), ..RobotFrame::of_scene(&scene) }, curves(&tree, q))
+        (RobotFrame { torque: measured_torque(&log, &names, row), ..RobotFrame::of_scene(&scene) }, curves(&tree, q))
     };
     Ok((Player::new(times, at), scene))
+}
+
+/// Returns the measured torques of a row, if those of all joints were measured.
+pub fn measured_torque(log: &Log, joints: &[&str], row: usize) -> Option<Vec<f32>> {
+    joints.iter().map(|joint| log.tau_measured(joint).map(|column| column[row] as f32)).collect()
 }
 
 /// Returns world-from-base and joint positions of each row. What was not measured is that of a robot that stands at the origin.
