@@ -285,7 +285,7 @@ fn recording_is_a_log_of_what_the_robot_did() {
         let log = twinstep_logs::Log::open(&path).unwrap();
         assert_eq!(log.meta().rate_hz, 500.0);
         let steps = recorded_steps(&path);
-        assert!((95..=110).contains(&steps.len()), "{} steps of 20 ms in 2 s", steps.len());
+        assert!((135..=150).contains(&steps.len()), "{} steps of 20 ms in 2 s, and 0.8 s to a stand", steps.len());
         let executed = steps.iter().filter(|step| step["refused"].is_null()).count();
         assert!(executed >= 90 && steps[50]["applied"].as_array().unwrap().len() == 12, "{executed}: {}", steps[50]);
         // Standing up takes 3 s.

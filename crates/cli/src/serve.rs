@@ -6,11 +6,12 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+use glam::Quat;
 use indicatif::{ProgressBar, ProgressStyle};
 use twinstep_agent::read_contract;
 use twinstep_env_server::{Config, EnvFactory, Server, ServerConfig, ServerError, SimEnvFactory, TreeEnvFactory};
 use twinstep_envs::TaskConfig;
-use twinstep_model::{AutoresetMode, ResetRequest, Scene};
+use twinstep_model::{AutoresetMode, InitialState, Pose, ResetRequest, RobotModel, Scene};
 use twinstep_sim::{Engine, SimConfig};
 use twinstep_viewer::{Hub, SceneInfo};
 
@@ -111,12 +112,12 @@ pub fn run(args: &Args) -> CommandResult {
     if let TaskConfig::Pose(_) = config.task {
         let factory = TreeEnvFactory::new(&config).map_err(input)?;
         let name = config.server.name_of(factory.robot_name());
-        let scene = scene(&name, &factory, |title, scene| SceneInfo::of_tree(title, scene, factory.tree()))?;
+        let scene = tree_scene(&name, &factory)?;
         return show_and_serve(args, &config, &name, factory, scene, &signals, is_orphan.as_ref());
     }
     let factory = SimEnvFactory::new(config.clone()).map_err(input)?;
     let name = config.server.name_of(&factory.robot().name);
-    let scene = scene(&name, &example(&config)?, |title, scene| SceneInfo::new(title, scene, factory.robot()))?;
+    let scene = scene(&config, factory.robot());
     show_and_serve(args, &config, &name, factory, scene, &signals, is_orphan.as_ref())
 }
 
@@ -171,22 +172,36 @@ fn serve(
     watch(server, signals, &|| stdin_closed.load(Ordering::Acquire) || is_orphan.is_some_and(OrphanCheck::is_orphan))
 }
 
-/// Returns the factory of the robots of a page. The engine makes no difference.
-fn example(config: &Config) -> Result<SimEnvFactory, Failure> {
-    let sim = SimConfig { engine: Engine::Batch, threads: 1, ..config.sim };
-    SimEnvFactory::new(Config { sim, ..config.clone() }).map_err(input)
+/// Returns a robot that stands at the origin, with the reward terms of its task.
+fn scene(config: &Config, robot: &RobotModel) -> SceneInfo {
+    let (q, ground) = (robot.control.default_pose_f32(), config.sim.terrain.ground());
+    let position = InitialState::standing_on(&ground, robot, q, 0.0).base_position;
+    let pose = Pose { position: position.into(), rotation: Quat::IDENTITY };
+    let scene = Scene::new(robot, pose, &q, &ground.crop(0.0, 0.0));
+    let info = SceneInfo::new(title(&config.server.name_of(&robot.name)), &scene, robot);
+    reward_terms(config).map_or(info.clone(), |names| info.with_reward_terms(&names))
 }
 
-/// Returns the first scene of a robot, with the reward terms of its task.
-fn scene(
-    name: &str,
-    factory: &impl EnvFactory,
-    info: impl FnOnce(String, &Scene) -> SceneInfo,
-) -> Result<SceneInfo, Failure> {
+/// Returns the reward terms of the task; `None` if it has no robots to show. The engine makes no difference.
+fn reward_terms(config: &Config) -> Option<Vec<String>> {
+    let sim = SimConfig { engine: Engine::Batch, threads: 1, ..config.sim };
+    let example = SimEnvFactory::new(Config { sim, ..config.clone() }).ok()?;
+    let mut env = example.build(1, AutoresetMode::Disabled, None).ok()?;
+    env.reset(&ResetRequest::default()).ok()?;
+    env.scene(0).ok()?;
+    Some(env.spec().reward_terms.clone())
+}
+
+/// Returns a robot of any tree at the start of an episode, with the reward terms of its task.
+fn tree_scene(name: &str, factory: &TreeEnvFactory) -> Result<SceneInfo, Failure> {
     let mut env = factory.build(1, AutoresetMode::Disabled, None).map_err(input)?;
     env.reset(&ResetRequest::default()).map_err(other)?;
     let first = env.scene(0).map_err(other)?;
-    Ok(info(format!("twinstep serve, robot {name}"), &first).with_reward_terms(&env.spec().reward_terms))
+    Ok(SceneInfo::of_tree(title(name), &first, factory.tree()).with_reward_terms(&env.spec().reward_terms))
+}
+
+fn title(name: &str) -> String {
+    format!("twinstep serve, robot {name}")
 }
 
 impl Args {

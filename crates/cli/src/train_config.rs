@@ -91,8 +91,8 @@ impl TrainConfig {
     pub fn robots(&self, threads: usize) -> Result<Robots, Failure> {
         let config = self.of_server(threads)?;
         Ok(match config.task {
-            TaskConfig::Pose(_) => Robots::Tree(TreeEnvFactory::new(&config).map_err(input)?),
-            _ => Robots::Quadruped(SimEnvFactory::new(config).map_err(input)?),
+            TaskConfig::Pose(_) => Robots::Tree(Box::new(TreeEnvFactory::new(&config).map_err(input)?)),
+            _ => Robots::Quadruped(Box::new(SimEnvFactory::new(config).map_err(input)?)),
         })
     }
 
@@ -112,17 +112,17 @@ impl TrainConfig {
 /// Robots that learn.
 pub enum Robots {
     /// Quadrupeds like the Go2.
-    Quadruped(SimEnvFactory),
+    Quadruped(Box<SimEnvFactory>),
     /// Robots of any tree.
-    Tree(TreeEnvFactory),
+    Tree(Box<TreeEnvFactory>),
 }
 
 impl Robots {
     /// Returns what builds their environments.
     pub fn factory(&self) -> &dyn EnvFactory {
         match self {
-            Self::Quadruped(factory) => factory,
-            Self::Tree(factory) => factory,
+            Self::Quadruped(factory) => &**factory,
+            Self::Tree(factory) => &**factory,
         }
     }
 

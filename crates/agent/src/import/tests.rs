@@ -102,8 +102,8 @@ fn env_yaml_is_resolved_by_its_expressions() {
     assert_eq!(mapping.observation[2].term, crate::TermName::AbsoluteJointPosition);
     assert_eq!(mapping.input_len(), 3 + 3 * 12 + 12);
     assert!(imported.notes.iter().any(|note| note.contains("normaliser")), "{:?}", imported.notes);
-    let indented = |text: &str| text.lines().map(|line| format!("  {line}\n")).collect::<String>();
-    let hydra = format!("env:\n{}agent:\n  clip_actions: 5.0\n", indented(ENV));
+    let indented = ENV.trim_end().replace('\n', "\n  ");
+    let hydra = format!("env:\n  {indented}\nagent:\n  clip_actions: 5.0\n");
     assert_eq!(self::imported(&[(".hydra/config.yaml", &hydra)]).1, mapping, "the file that Hydra keeps");
 }
 
