@@ -57,6 +57,21 @@ fn joints_of_a_robot_file_and_of_a_log_move_on_a_page() {
     std::fs::write(folder.path().join("arm.json"), meta).unwrap();
     let page = scene("arm.csv", &["--model", &robot("so101.toml")]);
     assert!(page.contains("shoulder_pan") && !page.contains("FL_hip"), "the joints of the arm");
+    // Without its model the arm would be shown as a Go2 that does not move.
+    let arguments = ["view", "arm.csv", "--html", "page.html"];
+    let refused = Command::new(program()).args(arguments).current_dir(folder.path()).output().unwrap();
+    let error = String::from_utf8_lossy(&refused.stderr).into_owned();
+    assert_eq!(refused.status.code(), Some(2), "{error}");
+    assert!(error.contains("shoulder_pan") && error.contains("--model"), "{error}");
+}
+
+#[test]
+fn base_of_a_shipped_robot_is_fixed_if_it_is_asked_for() {
+    let folder = tempfile::tempdir().unwrap();
+    let text =
+        |base: &str| String::from_utf8(run(&["mjcf", "--model", "g1", "--base", base], folder.path()).stdout).unwrap();
+    assert!(text("floating").contains("<freejoint"));
+    assert!(!text("fixed").contains("<freejoint"));
 }
 
 #[test]

@@ -4,7 +4,7 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use twinstep_effects::is_robot_file;
-use twinstep_model::{BaseMount, MjcfOptions, go2, mjcf};
+use twinstep_model::{BaseMount, MjcfOptions, RobotTree, go2, mjcf};
 use twinstep_robot_files::{QuadrupedNames, TreeMjcf, quadruped, read_robot, write_mjcf};
 
 use crate::exit::{CommandResult, Failure, input, other};
@@ -85,7 +85,14 @@ fn of_model_file(path: Option<&Path>, options: &MjcfOptions) -> Result<String, F
         Err(refused) => refused,
     };
     let tree = of_any_tree(path).ok().and_then(|file| file.tree_model().ok()).ok_or(refused)?.tree;
-    Ok(write_mjcf(&tree, &TreeMjcf { timestep: options.timestep, ..TreeMjcf::default() }))
+    Ok(of_tree(tree, options))
+}
+
+fn of_tree(mut tree: RobotTree, options: &MjcfOptions) -> String {
+    if options.base == BaseMount::Fixed {
+        tree.base = Some(BaseMount::Fixed);
+    }
+    write_mjcf(&tree, &TreeMjcf { timestep: options.timestep, ..TreeMjcf::default() })
 }
 
 /// Returns the model of a robot file, as a tree if it has not the shape of the Go2. Prints what the file has and the model does not.
@@ -98,11 +105,7 @@ fn of_robot_file(path: &Path, options: &MjcfOptions) -> Result<String, Failure> 
         Err(why) => {
             let mut notes = file.notes.clone();
             notes.push(format!("exported with its own shapes, because it is no quadruped like the Go2: {why}"));
-            let mut tree = file.tree;
-            if options.base == BaseMount::Fixed {
-                tree.base = Some(BaseMount::Fixed);
-            }
-            (write_mjcf(&tree, &TreeMjcf { timestep: options.timestep, ..TreeMjcf::default() }), notes)
+            (of_tree(file.tree, options), notes)
         }
     };
     for note in notes {

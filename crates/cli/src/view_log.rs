@@ -2,7 +2,9 @@
 
 use std::path::Path;
 
+use twinstep_effects::TreeModelFile;
 use twinstep_identify::{Experiment, WindowConfig};
+use twinstep_inference::joint_indices;
 use twinstep_logs::Log;
 use twinstep_model::{FIXED_BASE_HEIGHT, Ground, InitialState, Joint, PerJoint, Pose, RobotModel, Scene, frames};
 use twinstep_sim::BatchRollout;
@@ -13,7 +15,7 @@ use crate::open_log::open_log;
 use crate::player::{Curves, Player};
 use crate::robot_file::SimulatedRobot;
 use crate::tree_model::tree_model;
-use crate::view_tree::{self, measured_torque};
+use crate::view_tree;
 use crate::web_view::PageArgs;
 
 /// Plays a log until a signal.
@@ -40,6 +42,8 @@ fn open(path: &Path, model: Option<&Path>) -> Result<(Player, SceneInfo), Failur
     if let Some(file) = model.map(|_| tree_model(model, &log)).transpose()?.flatten() {
         return view_tree::log(&log, path, &file);
     }
+    // The pose of joints that the robot does not have would be the default one, whatever the log says.
+    joint_indices(log.joints(), &TreeModelFile::go2().nominal.tree).map_err(input)?;
     let robot = SimulatedRobot::load(model, &log, path)?;
     player(log, path.display().to_string(), robot, model.is_some())
 }
@@ -120,7 +124,8 @@ struct Motion {
 impl Motion {
     fn at(&self, row: usize) -> (RobotFrame, Curves) {
         let measured = self.measured[row];
-        let torque = measured_torque(&self.log, &Joint::ALL.map(Joint::name), row);
+        let tau = Joint::ALL.map(|joint| self.log.tau_measured(joint.name()).map(|column| column[row] as f32));
+        let torque = tau.into_iter().collect::<Option<Vec<f32>>>();
         let mut robot = RobotFrame { torque, ..RobotFrame::of_scene(&measured.scene(&self.robot)) };
         let mut curves = Vec::new();
         if self.simulated.is_empty() {

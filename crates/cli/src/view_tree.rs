@@ -4,11 +4,12 @@ use std::path::Path;
 
 use glam::{DAffine3, DQuat, DVec3};
 use twinstep_effects::{TreeModelFile, shipped_robots};
+use twinstep_inference::joint_indices;
 use twinstep_logs::Log;
 use twinstep_model::{BaseMount, Ground, RobotTree, Scene, TreeJointKind, TreeModel};
 use twinstep_viewer::{Frame, RobotFrame, SceneInfo};
 
-use crate::exit::{CommandResult, Failure, Signals};
+use crate::exit::{CommandResult, Failure, Signals, input};
 use crate::player::{Curves, Player};
 use crate::tree_model::of_any_tree;
 use crate::web_view::PageArgs;
@@ -73,32 +74,36 @@ fn sweep(pose: &[f64], ranges: &[[f64; 2]], time: f64) -> Vec<f64> {
 /// Returns a player of a log of the robot of a model file.
 pub fn log(log: &Log, path: &Path, file: &TreeModelFile) -> Result<(Player, SceneInfo), Failure> {
     let model = file.tree_model().map_err(|cause| Failure::Input(miette::miette!("{cause}")))?;
-    let (tree, poses) = (model.tree.clone(), measured_poses(log, &model, &file.pose()));
+    let indices = joint_indices(log.joints(), &model.tree).map_err(input)?;
+    let (tree, poses) = (model.tree.clone(), measured_poses(log, &model, &indices, &file.pose()));
     let scene = info(path, &tree, poses[0].0, &poses[0].1);
     let log = log.clone();
     let times = log.t().to_vec();
     let at = move |row: usize| {
         let (base, q) = &poses[row];
-        let names: Vec<&str> = tree.joints.iter().map(|joint| joint.name.as_str()).collect();
         let scene = Scene::of_tree(&tree, *base, q, &Ground::FLAT);
-        (RobotFrame { torque: measured_torque(&log, &names, row), ..RobotFrame::of_scene(&scene) }, curves(&tree, q))
+        let mut torque = vec![f32::NAN; tree.joints.len()];
+        for (name, joint) in log.joints().iter().zip(&indices) {
+            if let Some(column) = log.tau_measured(name) {
+                torque[*joint] = column[row] as f32;
+            }
+        }
+        (RobotFrame { torque: Some(torque), ..RobotFrame::of_scene(&scene) }, curves(&tree, q))
     };
     Ok((Player::new(times, at), scene))
 }
 
-/// Returns the measured torques of a row, if those of all joints were measured.
-pub fn measured_torque(log: &Log, joints: &[&str], row: usize) -> Option<Vec<f32>> {
-    joints.iter().map(|joint| log.tau_measured(joint).map(|column| column[row] as f32)).collect()
-}
-
 /// Returns world-from-base and joint positions of each row. What was not measured is that of a robot that stands at the origin.
-fn measured_poses(log: &Log, model: &TreeModel, default_pose: &[f64]) -> Vec<(DAffine3, Vec<f64>)> {
-    let columns: Vec<_> = model.tree.joints.iter().map(|joint| log.q(&joint.name)).collect();
+fn measured_poses(log: &Log, model: &TreeModel, indices: &[usize], default_pose: &[f64]) -> Vec<(DAffine3, Vec<f64>)> {
     let position = ["pos_x", "pos_y", "pos_z"].map(|name| log.channel(name));
     let orientation = ["quat_w", "quat_x", "quat_y", "quat_z"].map(|name| log.channel(name));
     let pose = |row: usize| {
-        let q: Vec<f64> =
-            columns.iter().zip(default_pose).map(|(column, rest)| column.map_or(*rest, |column| column[row])).collect();
+        let mut q = default_pose.to_vec();
+        for (name, joint) in log.joints().iter().zip(indices) {
+            if let Some(column) = log.q(name) {
+                q[*joint] = column[row];
+            }
+        }
         let mut base = standing_base(model, &q);
         if let [Some(w), Some(x), Some(y), Some(z)] = orientation {
             let rotation = DQuat::from_xyzw(x[row], y[row], z[row], w[row]).normalize();

@@ -127,8 +127,8 @@ fn split_at_gaps(log: &Log, range: Range<usize>) -> impl Iterator<Item = Range<u
     (1..starts.len()).map(move |part| starts[part - 1]..starts[part])
 }
 
-/// Returns the joint of the robot for each joint of the log.
-fn joint_indices(names: &[String], robot: &RobotTree) -> Result<Vec<usize>, InferenceError> {
+/// Returns the joint of the robot for each joint of the log, also if one of the names ends with `_joint`.
+pub fn joint_indices(names: &[String], robot: &RobotTree) -> Result<Vec<usize>, InferenceError> {
     let plain = |name: &str| name.to_lowercase().trim_end_matches("_joint").to_owned();
     let mut found = Vec::<usize>::new();
     for name in names {

@@ -26,7 +26,7 @@ mod window;
 pub use error::InferenceError;
 pub use evaluate::evaluate;
 pub use identify::{Estimate, Identification, identify};
-pub use joint_log::JointLog;
+pub use joint_log::{JointLog, joint_indices};
 pub use options::IdentifyOptions;
 pub use parameter::{Candidate, FreeParameter, ParameterRequest};
 pub use prior::{JointScale, Quantity};

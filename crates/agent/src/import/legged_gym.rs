@@ -110,13 +110,13 @@ impl ObservationOrder {
     pub fn of(lengths: [Option<usize>; 2]) -> Option<Self> {
         let has = |len: usize| lengths.contains(&Some(len));
         let has_steps_of = |one: usize| lengths.iter().flatten().any(|len| *len > one && len.is_multiple_of(one));
-        match () {
-            () if has_steps_of(45) => Some(Self::CommandFirst),
-            () if has(45) => Some(Self::WithoutVelocity),
-            () if has(47) => Some(Self::WithClock),
-            () if has(48) || has_steps_of(48) => Some(Self::WithVelocity),
-            () => None,
-        }
+        let fits = [
+            (has_steps_of(45), Self::CommandFirst),
+            (has(45), Self::WithoutVelocity),
+            (has(47), Self::WithClock),
+            (has(48) || has_steps_of(48), Self::WithVelocity),
+        ];
+        fits.into_iter().find_map(|(fits, order)| fits.then_some(order))
     }
 
     /// Returns the length of one step.

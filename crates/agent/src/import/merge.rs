@@ -2,6 +2,8 @@
 
 use std::collections::BTreeMap;
 
+use twinstep_model::{Joint, go2};
+
 use super::facts::{Facts, Found, InputFacts, TermFacts};
 use crate::mapping::{History, HistoryLayout, HistoryOrder, TermName};
 use crate::onnx::OnnxNetwork;
@@ -151,6 +153,12 @@ impl Draft {
                 }
             }
         }
+        let outside =
+            first.as_ref().filter(|_| key == "default_pose").and_then(|(pose, _)| outside_range(&joints, pose));
+        if let Some(outside) = outside {
+            self.missing.push(format!("{key}: {outside}"));
+            return;
+        }
         match first {
             Some((values, place)) => {
                 self.origins.push((key.to_owned(), place));
@@ -253,6 +261,20 @@ impl Draft {
             }
         }
     }
+}
+
+/// Says which joint a pose puts outside the range of the Go2.
+fn outside_range(joints: &[String], pose: &[f64]) -> Option<String> {
+    let robot = go2();
+    joints.iter().zip(pose).find_map(|(name, q)| {
+        let [low, high] = robot.joints[name.parse::<Joint>().ok()?.index()].range;
+        (!(low..=high).contains(q)).then(|| {
+            format!(
+                "{name} = {q} is outside the range of the Go2, {low:.2} to {high:.2} rad: the config is that of another robot, or its \
+                 joints have another order"
+            )
+        })
+    })
 }
 
 fn same_terms(one: &InputFacts, other: &InputFacts) -> bool {

@@ -218,14 +218,18 @@ fn unitree_rl_gym_has_its_joints_in_the_order_of_the_motors() {
     assert_eq!((imported.missing, imported.disagreements), (vec![], vec![]));
     let simulated = RL_GYM.replace("control_dt: 0.02", "simulation_dt: 0.002\ncontrol_decimation: 10");
     assert_eq!(self::imported(&[("go2.yaml", &simulated)]).1.policy_hz, 50.0);
-    for humanoid in [
-        format!("{RL_GYM}arm_waist_joint2motor_idx: [12, 13]\n"),
-        format!("{RL_GYM}xml_path: robots/g1_description/scene.xml\n"),
-    ] {
-        let (_folder, path) = written(&[("g1.yaml", &humanoid)]);
-        let error = import_policy(&[path]).expect_err("a humanoid").to_string();
-        assert!(error.contains("humanoid"), "{error}");
-    }
+}
+
+#[test]
+fn config_of_another_robot_is_recognised_by_its_pose() {
+    // The legs of a G1: six joints each, and a knee where the Go2 has the hip of its right leg.
+    let pose = "[-0.1, 0.0, 0.0, 0.3, -0.2, 0.0, -0.1, 0.0, 0.0, 0.3, -0.2, 0.0]";
+    let humanoid = RL_GYM.replace("[0.1, 0.8, -1.5, -0.1, 0.8, -1.5, 0.1, 1.0, -1.5, -0.1, 1.0, -1.5]", pose);
+    let (_folder, path) = written(&[("g1.yaml", &humanoid)]);
+    let imported = import_policy(&[path]).expect("sources");
+    let outside = |line: &String| line.starts_with("default_pose: FL_calf = 0 is outside the range of the Go2");
+    assert!(imported.missing.iter().any(outside), "{:?}", imported.missing);
+    assert!(Mapping::parse(&imported.mapping).is_err(), "no mapping of it runs");
 }
 
 #[test]
