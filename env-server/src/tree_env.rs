@@ -1,166 +1,195 @@
-//! Environments of the task `pose` on robots of any tree.
+//! Environments of robots of any tree.
 
-use glam::{DAffine3, DQuat};
-use twinstep_envs::{PoseState, PoseTask, TreeView};
+use glam::{DAffine3, DQuat, Vec3};
+use twinstep_envs::{ControlledRobot, Episode, NoisyEntry, Randomisation, StepOutcome, Task, add_noise};
 use twinstep_model::{
-    AutoresetMode, EndedEpisode, EnvError, EnvSpec, Ground, ResetRequest, Scene, StepBatch, Stream, TreeModel, VecEnv,
-    stream,
+    AgentCommands, AutoresetMode, BackendError, BaseMount, EndedEpisode, EnvError, EnvSpec, GaitCommand, Ground,
+    ResetRequest, Scene, StepBatch, TreeModel, VecEnv, VelocityCommand, frames,
 };
 use twinstep_sim::{Placement, TreeCommand, TreeError, TreeReadings, TreeSimulation};
 
-/// Robots of one tree that follow targets of their joints.
-pub struct TreeEnv {
-    task: PoseTask,
+use crate::tree_readings::RobotRow;
+
+/// Initial height of the lowest contact point of a free robot above the ground, as for quadrupeds [m].
+const START_CLEARANCE: f64 = 0.01;
+
+/// Robots of one tree, each with an episode of a task.
+pub struct TreeEnv<T: Task> {
+    task: T,
+    spec: EnvSpec,
+    control: ControlledRobot,
     robot: TreeModel,
+    ground: Ground,
     simulation: TreeSimulation,
+    randomise: Randomisation,
+    noise: Vec<NoisyEntry>,
     autoreset: AutoresetMode,
-    episodes: Vec<TreeEpisode>,
+    episodes: Vec<Episode<T::State>>,
+    rows: Vec<RobotRow>,
     commands: Vec<TreeCommand>,
+    /// Commands of the agent.
+    agent_commands: AgentCommands,
+    /// Commands of the agent that were set since the last step.
+    next_agent_commands: AgentCommands,
     batch: StepBatch,
 }
 
-/// Episode of one robot.
-struct TreeEpisode {
-    state: PoseState,
-    random: Stream,
-    running: bool,
-    diverged: bool,
-    length: u32,
-    episode_return: f32,
-    terms: Vec<f32>,
-    term_sums: Vec<f32>,
-    action: Vec<f32>,
-    previous_action: Vec<f32>,
+/// Settings of a [`TreeEnv`].
+pub struct TreeEnvConfig {
+    /// The ground of the simulation.
+    pub ground: Ground,
+    /// Domain randomisation.
+    pub randomise: Randomisation,
+    /// When a new episode starts after one has ended.
+    pub autoreset: AutoresetMode,
+    /// Number of policy steps after which an episode is truncated. Default: that of the task.
+    pub max_episode_steps: Option<u32>,
+    /// Seed of environment 0 until a reset sets another. Environment `i` has the seed `seed + i`.
+    pub seed: u64,
 }
 
-impl TreeEnv {
-    /// Creates an environment for each robot of a simulation. `seed` is that of episodes that a client does not seed.
+impl<T: Task> TreeEnv<T> {
+    /// Creates an environment for each robot of a simulation.
     pub fn new(
-        task: PoseTask,
+        task: T,
+        control: ControlledRobot,
         robot: TreeModel,
         simulation: TreeSimulation,
-        autoreset: AutoresetMode,
-        seed: u64,
+        settings: TreeEnvConfig,
     ) -> Self {
         let (num_envs, joints) = (simulation.num_robots(), robot.joints.len());
-        let single = |part: usize| task.robot().gains.iter().map(|gains| gains[part] as f32).collect::<Vec<_>>();
+        let mut spec = task.spec().clone();
+        spec.max_episode_steps = settings.max_episode_steps.unwrap_or(spec.max_episode_steps);
+        let single = |part: usize| control.gains.iter().map(|gains| gains[part] as f32).collect::<Vec<_>>();
         let command = TreeCommand { kp: single(0), kd: single(1), ..TreeCommand::hold(vec![0.0; joints], 0.0, 0.0) };
-        let episode = |env: u64| TreeEpisode {
-            state: PoseState::default(),
-            random: stream(seed.wrapping_add(env), "pose", 0),
-            running: false,
-            diverged: false,
-            length: 0,
-            episode_return: 0.0,
-            terms: vec![0.0; task.spec().reward_terms.len()],
-            term_sums: vec![0.0; task.spec().reward_terms.len()],
-            action: vec![0.0; joints],
-            previous_action: vec![0.0; joints],
-        };
+        let not_started = |env: u64| Episode::not_started(&task, settings.seed.wrapping_add(env));
         Self {
-            autoreset,
-            episodes: (0..num_envs as u64).map(episode).collect(),
+            randomise: settings.randomise,
+            noise: settings.randomise.noise.entries(&spec),
+            autoreset: settings.autoreset,
+            episodes: (0..num_envs as u64).map(not_started).collect(),
+            rows: vec![RobotRow::new(&robot, &control.feet); num_envs],
             commands: vec![command; num_envs],
-            batch: StepBatch::new(num_envs, task.spec()),
+            agent_commands: AgentCommands::default(),
+            next_agent_commands: AgentCommands::default(),
+            batch: StepBatch::new(num_envs, &spec),
+            spec,
             task,
+            control,
             robot,
+            ground: settings.ground,
             simulation,
         }
     }
 
     fn check_actions(&self, actions: &[f32]) -> Result<(), EnvError> {
-        let action_len = self.task.spec().action_len();
+        let action_len = self.spec.action_len();
         let expected = self.num_envs() * action_len;
         if actions.len() != expected {
             return Err(EnvError::WrongLength { field: "actions", given: actions.len(), expected });
         }
         if let Some(index) = actions.iter().position(|value| !value.is_finite()) {
-            let entry = self.task.spec().action_entry(index % action_len);
+            let entry = self.spec.action_entry(index % action_len);
             return Err(EnvError::ActionNotFinite { env: index / action_len, entry, value: actions[index] });
         }
         let restarts = self.autoreset != AutoresetMode::Disabled;
-        let needs_reset = |episode: &TreeEpisode| !episode.running && (!restarts || episode.length == 0);
+        let needs_reset = |episode: &Episode<T::State>| !episode.running && (!restarts || !episode.was_started());
         self.episodes.iter().position(needs_reset).map_or(Ok(()), |env| Err(EnvError::NeedsReset { env }))
     }
 
     /// Starts an episode of a robot at rest, and observes it.
     fn start(&mut self, env: usize) -> Result<(), EnvError> {
-        let episode = &mut self.episodes[env];
-        let (q, state) = self.task.start(&mut episode.random);
-        self.simulation.reset(env, &self.robot, &Placement::of(&self.robot.tree, q)).map_err(failed)?;
-        episode.state = state;
-        (episode.running, episode.diverged) = (true, false);
-        (episode.length, episode.episode_return) = (0, 0.0);
-        episode.term_sums.fill(0.0);
-        episode.action.fill(0.0);
+        let Self { task, episodes, randomise, robot, simulation, ground, .. } = self;
+        let start = episodes[env].start(task, randomise, |_, random| randomise.sample_tree(robot, random));
+        let q = start.q.into_iter().map(f64::from).collect();
+        let model = start.robot.as_ref().unwrap_or(robot);
+        let mut placement = Placement::standing_on(ground, robot, q);
+        placement.base_position[2] += if self.control.standing_height.is_some() { START_CLEARANCE } else { 0.0 };
+        simulation.reset(env, model, &placement).map_err(failed)?;
+        set_commands(task, &self.agent_commands, env, &mut episodes[env].state);
         self.observe(env);
         Ok(())
     }
 
+    /// Reads a robot and writes its observations.
     fn observe(&mut self, env: usize) {
-        let (episode, len) = (&self.episodes[env], self.task.spec().obs_len());
-        let robot = view(&self.simulation.states()[env]);
-        self.task.observe(&episode.state, &robot, &episode.action, &mut self.batch.obs[env * len..(env + 1) * len]);
+        let Self { rows, simulation, episodes, task, batch, spec, noise, ground, .. } = self;
+        rows[env].read(&simulation.states()[env]);
+        let (episode, robot) = (&mut episodes[env], rows[env].view(ground));
+        let obs = row(&mut batch.obs, env, spec.obs_len());
+        task.observe(&episode.state, &robot, &episode.action, obs);
+        add_noise(noise, obs, &mut episode.noise);
+        if !spec.critic_observation.is_empty() {
+            task.observe_critic(&episode.state, &robot, row(&mut batch.critic_obs, env, spec.critic_obs_len()));
+        }
     }
 
-    /// Sets the targets of the drives.
-    fn command(&mut self, actions: &[f32]) {
-        let (pose, scale) = (&self.task.robot().default_pose, self.task.robot().action_scale);
-        let rows = actions.chunks_exact(pose.len());
-        for ((episode, command), action) in self.episodes.iter_mut().zip(&mut self.commands).zip(rows) {
-            std::mem::swap(&mut episode.previous_action, &mut episode.action);
-            for (joint, value) in action.iter().enumerate() {
-                episode.action[joint] = value.clamp(-1.0, 1.0);
-                command.q[joint] = (pose[joint] + scale * f64::from(episode.action[joint])) as f32;
+    /// Sets the targets of the actuators, and pushes the robots whose next push is due.
+    fn command(&mut self, actions: &[f32]) -> Result<(), EnvError> {
+        let (pose, scale) = (&self.control.default_pose, self.control.action_scale);
+        for (env, action) in actions.chunks_exact(pose.len()).enumerate() {
+            let episode = &mut self.episodes[env];
+            episode.act(action, &self.rows[env].dq);
+            for (joint, target) in self.commands[env].q.iter_mut().enumerate() {
+                *target = (pose[joint] + scale * f64::from(episode.action[joint])) as f32;
+            }
+            if self.randomise.has_pushes()
+                && episode.running
+                && let Some(velocity) = episode.next_push(&self.randomise, self.spec.policy_dt)
+            {
+                self.simulation.push(env, velocity).map_err(failed)?;
             }
         }
+        Ok(())
     }
 
     /// Writes reward, end flags and observation of a robot whose episode runs.
     fn finish(&mut self, env: usize) {
-        let readings = &self.simulation.states()[env];
-        let episode = &mut self.episodes[env];
-        episode.length += 1;
-        self.batch.reward[env] = 0.0;
-        (self.batch.terminated[env], self.batch.truncated[env]) = (false, false);
-        if !is_finite(readings) {
-            // A diverged robot keeps its last observation.
-            (episode.running, episode.diverged, self.batch.truncated[env]) = (false, true, true);
-            return;
+        let Self { rows, simulation, episodes, task, spec, ground, .. } = self;
+        let (readings, episode) = (&simulation.states()[env], &mut episodes[env]);
+        // A diverged robot keeps its last observation.
+        let mut outcome = StepOutcome { truncated: true, ..StepOutcome::default() };
+        let is_finite = is_finite(readings);
+        if is_finite {
+            rows[env].read(readings);
+            outcome = episode.evaluate_step(task, rows[env].view(ground), spec.max_episode_steps);
+            self.observe(env);
+        } else {
+            episode.diverge();
         }
-        let TreeEpisode { state, random, terms, action, previous_action, .. } = episode;
-        let terminated = self.task.evaluate(state, &view(readings), [action, previous_action], random, terms);
-        let reward: f32 = terms.iter().sum();
-        episode.episode_return += reward;
-        episode.term_sums.iter_mut().zip(&episode.terms).for_each(|(sum, term)| *sum += term);
-        let timed_out = episode.length >= self.task.spec().max_episode_steps;
-        episode.running = !(terminated || timed_out);
+        self.write(env, outcome);
+    }
+
+    fn write(&mut self, env: usize, StepOutcome { reward, terminated, truncated }: StepOutcome) {
         self.batch.reward[env] = reward;
-        (self.batch.terminated[env], self.batch.truncated[env]) = (terminated, timed_out && !terminated);
-        self.observe(env);
+        (self.batch.terminated[env], self.batch.truncated[env]) = (terminated, truncated);
     }
 
     fn report(&mut self, env: usize) {
-        let (episode, len) = (&self.episodes[env], self.task.spec().obs_len());
-        let final_obs = match self.autoreset {
-            AutoresetMode::SameStep => self.batch.obs[env * len..(env + 1) * len].to_vec(),
-            AutoresetMode::NextStep | AutoresetMode::Disabled => Vec::new(),
+        let Self { batch, episodes, spec, autoreset, .. } = self;
+        let episode = &episodes[env];
+        let (final_obs, final_critic_obs) = match autoreset {
+            AutoresetMode::SameStep => (
+                row(&mut batch.obs, env, spec.obs_len()).to_vec(),
+                row(&mut batch.critic_obs, env, spec.critic_obs_len()).to_vec(),
+            ),
+            AutoresetMode::NextStep | AutoresetMode::Disabled => (Vec::new(), Vec::new()),
         };
-        self.batch.ended.push(EndedEpisode {
+        batch.ended.push(EndedEpisode {
             env,
             length: episode.length,
             episode_return: episode.episode_return,
             terms: episode.term_sums.clone(),
             diverged: episode.diverged,
             final_obs,
-            final_critic_obs: Vec::new(),
+            final_critic_obs,
         });
     }
 }
 
-impl VecEnv for TreeEnv {
+impl<T: Task> VecEnv for TreeEnv<T> {
     fn spec(&self) -> &EnvSpec {
-        self.task.spec()
+        &self.spec
     }
 
     fn num_envs(&self) -> usize {
@@ -175,7 +204,7 @@ impl VecEnv for TreeEnv {
         request.check(self.num_envs())?;
         for env in (0..self.num_envs()).filter(|env| request.selects(*env)) {
             if let Some(seeds) = &request.seeds {
-                self.episodes[env].random = stream(seeds[env], "pose", 0);
+                self.episodes[env].seed(&self.task, seeds[env]);
             }
             self.start(env)?;
         }
@@ -186,17 +215,37 @@ impl VecEnv for TreeEnv {
         &self.batch.obs
     }
 
+    fn critic_obs(&self) -> &[f32] {
+        &self.batch.critic_obs
+    }
+
+    fn set_velocity_commands(&mut self, commands: &[VelocityCommand]) -> Result<(), EnvError> {
+        self.spec.check_velocity_commands(commands, self.num_envs())?;
+        self.next_agent_commands.velocity = Some(commands.to_vec());
+        Ok(())
+    }
+
+    fn set_gait_commands(&mut self, commands: &[GaitCommand]) -> Result<(), EnvError> {
+        self.spec.check_gait_commands(commands, self.num_envs())?;
+        self.next_agent_commands.gait = Some(commands.to_vec());
+        Ok(())
+    }
+
     fn step(&mut self, actions: &[f32]) -> Result<&StepBatch, EnvError> {
+        let commands = std::mem::take(&mut self.next_agent_commands);
         self.check_actions(actions)?;
-        self.command(actions);
-        self.simulation.step(&self.commands, self.task.robot().decimation).map_err(failed)?;
+        for (env, episode) in self.episodes.iter_mut().enumerate() {
+            set_commands(&self.task, &commands, env, &mut episode.state);
+        }
+        self.agent_commands.update(commands);
+        self.command(actions)?;
+        self.simulation.step(&self.commands, self.control.decimation).map_err(failed)?;
         self.batch.ended.clear();
         for env in 0..self.num_envs() {
             if !self.episodes[env].running {
                 // The step after the last one of an episode resets the robot; its action has no effect.
                 self.start(env)?;
-                self.batch.reward[env] = 0.0;
-                (self.batch.terminated[env], self.batch.truncated[env]) = (false, false);
+                self.write(env, StepOutcome::default());
                 continue;
             }
             self.finish(env);
@@ -213,7 +262,7 @@ impl VecEnv for TreeEnv {
     fn scene(&self, env: usize) -> Result<Scene, EnvError> {
         let num_envs = self.num_envs();
         let episode = self.episodes.get(env).ok_or(EnvError::EnvOutOfRange { env, num_envs })?;
-        if !episode.running && episode.length == 0 {
+        if !episode.running && !episode.was_started() {
             return Err(EnvError::NeedsReset { env });
         }
         let TreeReadings { state, tau, shape_force } = &self.simulation.states()[env];
@@ -221,25 +270,53 @@ impl VecEnv for TreeEnv {
         let rotation = DQuat::from_xyzw(x, y, z, w).normalize();
         let base = DAffine3::from_rotation_translation(rotation, state.base_position.into());
         let numbers = |values: &[f64]| Some(values.iter().map(|value| *value as f32).collect());
+        let row = &self.rows[env];
+        let moves = !self.robot.tree.base.is_some_and(BaseMount::is_fixed) && self.control.standing_height.is_some();
+        let velocity = moves.then(|| {
+            let base_from_world = frames::world_from_base(row.orientation).inverse();
+            let linear = base_from_world * Vec3::from(row.base_linear_velocity);
+            [linear.x, linear.y, row.gyro[2]]
+        });
         Ok(Scene {
+            command: self.task.velocity_command(&episode.state),
+            velocity,
             torque: numbers(tau),
             contact_force: numbers(shape_force),
             reward_terms: episode.terms.clone(),
-            ..Scene::of_tree(&self.robot.tree, base, &state.q, &Ground::FLAT)
+            ..Scene::of_tree(
+                &self.robot.tree,
+                base,
+                &state.q,
+                &self.ground.crop(row.base_position[0], row.base_position[1]),
+            )
+        })
+    }
+
+    fn push(&mut self, env: usize, velocity: [f32; 3]) -> Result<(), EnvError> {
+        let num_envs = self.num_envs();
+        if env >= num_envs {
+            return Err(EnvError::EnvOutOfRange { env, num_envs });
+        }
+        self.simulation.push(env, velocity).map_err(|error| match error {
+            TreeError::FixedBase { .. } => BackendError::CannotPush { robot: env, reason: "its base is fixed" }.into(),
+            error => failed(error),
         })
     }
 }
 
-fn view(readings: &TreeReadings) -> TreeView<'_> {
-    let state = &readings.state;
-    TreeView {
-        q: &state.q,
-        dq: &state.dq,
-        tau: &readings.tau,
-        orientation: state.base_orientation.map(|part| part as f32),
-        angular_velocity: state.base_angular_velocity.map(|part| part as f32),
-        height: state.base_position[2],
+/// Sets the agent's commands of environment `env` in the state of its episode.
+fn set_commands<T: Task>(task: &T, commands: &AgentCommands, env: usize, state: &mut T::State) {
+    if let Some(commands) = &commands.velocity {
+        task.set_velocity_command(state, commands[env]);
     }
+    if let Some(commands) = &commands.gait {
+        task.set_gait_command(state, commands[env]);
+    }
+}
+
+/// Returns entries of environment `env` in an array with `len` entries per environment.
+fn row(array: &mut [f32], env: usize, len: usize) -> &mut [f32] {
+    &mut array[env * len..(env + 1) * len]
 }
 
 fn is_finite(readings: &TreeReadings) -> bool {

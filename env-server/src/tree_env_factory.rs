@@ -3,12 +3,12 @@
 use std::path::Path;
 
 use twinstep_effects::{NominalGain, TreeModelFile};
-use twinstep_envs::{ControlledRobot, PoseConfig, PoseTask, Randomisation, TaskConfig};
-use twinstep_model::{AutoresetMode, BaseMount, JOINT_NAMES, RobotTree, TreeModel, VecEnv, go2};
+use twinstep_envs::{ControlledRobot, PoseTask, Randomisation, Task, TaskConfig, Walk};
+use twinstep_model::{AutoresetMode, BaseMount, Feet, JOINT_NAMES, RobotTree, TreeModel, VecEnv, go2};
 use twinstep_protocol::random_u64;
-use twinstep_sim::{BackendBuildError, Placement, SimConfig, Terrain, TreeSimulation};
+use twinstep_sim::{BackendBuildError, Placement, SimConfig, TreeSimulation};
 
-use crate::tree_env::TreeEnv;
+use crate::tree_env::{TreeEnv, TreeEnvConfig};
 use crate::{Config, EnvFactory, EnvFactoryError};
 
 /// Rate of actuators and policy [Hz] and joint offset of an action of 1 [rad] if the model file states none.
@@ -16,9 +16,10 @@ const ACTUATOR_HZ: f64 = 200.0;
 const POLICY_HZ: f64 = 50.0;
 const ACTION_SCALE: f64 = 0.25;
 
-/// Builds environments of the task `pose` for the robot of a model file, of any tree.
+/// Builds environments of the tasks `pose` and `walk` for the robot of a model file, of any tree.
 pub struct TreeEnvFactory {
-    task: PoseConfig,
+    task: TaskConfig,
+    randomise: Randomisation,
     sim: SimConfig,
     robot: TreeModel,
     control: ControlledRobot,
@@ -31,14 +32,20 @@ impl TreeEnvFactory {
         if config.control.is_some() {
             return Err(EnvFactoryError::ContractOfQuadrupeds);
         }
-        let TaskConfig::Pose(task) = &config.task else {
-            return Err(refused("task.name", "a robot of any tree has the task `pose`"));
-        };
-        if config.randomise != Randomisation::default() {
-            return Err(refused("randomise", "robots of the task `pose` are not randomised yet; leave it out"));
+        if !matches!(config.task, TaskConfig::Pose(_) | TaskConfig::Walk(_)) {
+            return Err(refused("task.name", "a robot of any tree has the tasks `pose` and `walk`"));
         }
-        if config.sim.terrain != Terrain::Flat {
-            return Err(refused("sim.terrain", "the task `pose` is on flat ground; use \"flat\""));
+        if config.task.epistemic_uncertainty_weight().1 != 0.0 {
+            return Err(refused(
+                "task.reward.epistemic_uncertainty",
+                "a robot of any tree has no actuator networks; use 0",
+            ));
+        }
+        if config.randomise.effects {
+            return Err(refused(
+                "randomise.effects",
+                "the intervals of a robot of any tree are not sampled yet; use false",
+            ));
         }
         let file = match &config.server.model {
             Some(path) => model(path)?,
@@ -47,14 +54,25 @@ impl TreeEnvFactory {
         let robot = file.tree_model().expect("the file was checked when it was read");
         let control = controlled_robot(&file, &robot, config.sim.base)?;
         let seed = config.server.seed.unwrap_or_else(random_u64);
-        let factory = Self { task: task.clone(), sim: config.sim, robot, control, seed };
-        factory.simulation(1)?;
+        let (task, randomise, sim) = (config.task.clone(), config.randomise, config.sim);
+        randomise.check()?;
+        randomise.check_base(robot.tree.bodies[0].inertia.mass)?;
+        if randomise.has_pushes() && control.standing_height.is_none() {
+            return Err(refused("randomise.push_m_s", "the base of the robot is fixed; use [0, 0]"));
+        }
+        let factory = Self { task, randomise, sim, robot, control, seed };
+        factory.build(1, AutoresetMode::Disabled, None)?;
         Ok(factory)
     }
 
     /// Returns the name of the robot.
     pub fn robot_name(&self) -> &str {
         &self.control.name
+    }
+
+    /// Returns the robot as its task sees it.
+    pub fn control(&self) -> &ControlledRobot {
+        &self.control
     }
 
     /// Returns the tree of the robot.
@@ -75,9 +93,21 @@ impl EnvFactory for TreeEnvFactory {
         autoreset: AutoresetMode,
         max_episode_steps: Option<u32>,
     ) -> Result<Box<dyn VecEnv>, EnvFactoryError> {
-        let task = PoseTask::new(self.task.clone(), self.control.clone(), max_episode_steps)?;
         let simulation = self.simulation(num_envs)?;
-        Ok(Box::new(TreeEnv::new(task, self.robot.clone(), simulation, autoreset, self.seed)))
+        let (ground, randomise, seed) = (self.sim.terrain.ground(), self.randomise, self.seed);
+        let settings = TreeEnvConfig { ground, randomise, autoreset, max_episode_steps, seed };
+        let control = self.control.clone();
+        match &self.task {
+            TaskConfig::Walk(config) => Ok(self.env(Walk::of(config.clone(), control, true)?, simulation, settings)),
+            TaskConfig::Pose(config) => Ok(self.env(PoseTask::new(config.clone(), control)?, simulation, settings)),
+            _ => unreachable!("`new` has refused the others"),
+        }
+    }
+}
+
+impl TreeEnvFactory {
+    fn env<T: Task + 'static>(&self, task: T, simulation: TreeSimulation, settings: TreeEnvConfig) -> Box<dyn VecEnv> {
+        Box::new(TreeEnv::new(task, self.control.clone(), self.robot.clone(), simulation, settings))
     }
 }
 
@@ -134,7 +164,7 @@ fn controlled_robot(
     }
     let default_pose = file.pose();
     let is_fixed = base.is_fixed() || robot.tree.base.is_some_and(BaseMount::is_fixed);
-    Ok(ControlledRobot {
+    let controlled = ControlledRobot {
         name: robot.tree.name.clone(),
         standing_height: (!is_fixed).then(|| robot.tree.standing_height(&default_pose)),
         joints,
@@ -145,5 +175,9 @@ fn controlled_robot(
         action_scale: file.action_scale.unwrap_or(ACTION_SCALE),
         actuator_dt: 1.0 / actuator_hz,
         decimation: decimation as usize,
-    })
+        mass: robot.tree.total_mass(),
+        feet: Feet::new(&robot.tree, Vec::new()),
+        hips: Vec::new(),
+    };
+    Ok(controlled.with_feet(robot, &file.groups)?)
 }

@@ -90,6 +90,102 @@ fn humanoid_is_stepped_over_the_network_as_in_process() {
     server.shutdown();
 }
 
+/// Reward terms that are the same quantity in both engines. The others count contacts of other shapes.
+const SAME_TERMS: [&str; 11] = [
+    "track_linear_velocity",
+    "track_angular_velocity",
+    "linear_velocity_z",
+    "angular_velocity_xy",
+    "flat_orientation",
+    "base_height",
+    "joint_torque",
+    "action_rate",
+    "joint_position_limits",
+    "hip_deviation",
+    "stand_still",
+];
+
+#[test]
+fn go2_as_a_tree_walks_as_the_quadruped() {
+    let mut config = config(TaskConfig::default());
+    config.sim.threads = 1;
+    let mut tree = TreeEnvFactory::new(&config).unwrap().build(4, AutoresetMode::Disabled, None).unwrap();
+    let mut quadruped = SimEnvFactory::new(config).unwrap().build(4, AutoresetMode::Disabled, None).unwrap();
+    assert_eq!(tree.spec().hash(), quadruped.spec().hash(), "a policy of one is a policy of the other");
+    let request = ResetRequest::seeded(7, 4);
+    let (one, other) = (tree.reset(&request).unwrap().to_vec(), quadruped.reset(&request).unwrap().to_vec());
+    let mut obs = [one, other];
+    for step in 0..100 {
+        for (index, (one, other)) in obs[0].iter().zip(&obs[1]).enumerate() {
+            let name = tree.spec().observation_entry(index % 45);
+            let bound = if name.starts_with("joint_velocity") { 1.0 } else { 0.05 };
+            assert!((one - other).abs() < bound, "step {step}, {name}: {one} {other}");
+        }
+        let actions: Vec<f32> = (0..48).map(|entry| 0.2 * (0.3 * step as f32 + entry as f32).sin()).collect();
+        let steps = [&mut tree, &mut quadruped].map(|env| env.step(&actions).unwrap().clone());
+        let terms = [&tree, &quadruped].map(|env| env.scene(1).unwrap().reward_terms);
+        for (index, name) in quadruped.spec().reward_terms.iter().enumerate() {
+            let (one, other) = (terms[0][index], terms[1][index]);
+            let is_same = SAME_TERMS.contains(&name.as_str());
+            assert!(!is_same || (one - other).abs() < 4e-3, "step {step}, {name}: {one} {other}");
+        }
+        obs = steps.map(|batch| batch.obs);
+    }
+}
+
+#[test]
+fn every_legged_robot_walks_and_an_arm_is_told_what_it_lacks() {
+    for (name, feet) in [("g1", 2), ("anymal_c", 4), ("mini_cheetah", 4)] {
+        let config = Config { task: TaskConfig::default(), ..pose_config(name) };
+        let factory = TreeEnvFactory::new(&config).unwrap();
+        assert_eq!(factory.control().feet.len(), feet, "{name}");
+        let mut env = factory.build(3, AutoresetMode::SameStep, Some(20)).unwrap();
+        let joints = env.spec().action_len();
+        assert_eq!((env.spec().obs_len(), env.spec().critic_obs_len()), (9 + 3 * joints, 7 + feet), "{name}");
+        check_vec_env(env.as_mut(), 45).unwrap_or_else(|error| panic!("{name}: {error}"));
+        env.reset(&ResetRequest::default()).unwrap();
+        env.set_velocity_commands(&[[0.3, 0.0, 0.1]; 3]).unwrap();
+        (0..10).for_each(|_| drop(env.step(&vec![0.0; 3 * joints]).unwrap().clone()));
+        let batch = env.step(&vec![0.0; 3 * joints]).unwrap();
+        assert_eq!(batch.obs[6..9], [0.3, 0.0, 0.1]);
+        // It stands on its feet.
+        let force: f32 = batch.critic_obs[7..7 + feet].iter().sum();
+        assert!(force > 20.0 && batch.terminated == [false; 3], "{name}: {force} N");
+    }
+    let arm = Config { task: TaskConfig::default(), ..pose_config("so101") };
+    let error = TreeEnvFactory::new(&arm).err().unwrap().to_string();
+    assert_eq!(error, "`task.name` = walk is not allowed: `pose` for a robot whose base is fixed");
+}
+
+#[test]
+fn episodes_of_a_tree_have_their_own_robots_and_are_pushed() {
+    let observe = |change: &dyn Fn(&mut Config)| {
+        let mut config = pose_config("mini_cheetah");
+        change(&mut config);
+        let mut env = env(&config, 2, AutoresetMode::SameStep);
+        env.reset(&ResetRequest::seeded(3, 2)).unwrap();
+        (0..15).for_each(|_| drop(env.step(&[0.1; 24]).unwrap().clone()));
+        env.obs().to_vec()
+    };
+    let nominal = observe(&|_| {});
+    for change in [
+        (&|config: &mut Config| config.randomise.mass_scale = [1.3, 1.3]) as &dyn Fn(&mut Config),
+        &|config| config.randomise.payload_kg = [2.0, 2.0],
+        &|config| config.randomise.kp_scale = [0.7, 0.7],
+        &|config| config.randomise.command_delay_ms = [20.0, 20.0],
+        &|config| config.randomise.noise.joint_position_rad = 0.1,
+        &|config| {
+            config.randomise.push_m_s = [1.0, 1.0];
+            config.randomise.push_interval_s = [0.1, 0.1];
+        },
+    ] {
+        let changed = observe(change);
+        let difference = nominal.iter().zip(&changed).map(|(one, other)| (one - other).abs()).fold(0.0, f32::max);
+        assert!(difference > 0.005, "{difference}");
+        assert!(changed[..54] != changed[54..], "each robot has its own episode");
+    }
+}
+
 #[test]
 fn settings_that_a_tree_does_not_have_are_refused_by_name() {
     let error = |change: &dyn Fn(&mut Config)| {
@@ -97,14 +193,17 @@ fn settings_that_a_tree_does_not_have_are_refused_by_name() {
         change(&mut config);
         TreeEnvFactory::new(&config).err().unwrap().to_string()
     };
-    let walk = error(&|config| config.task = TaskConfig::default());
-    assert_eq!(walk, "`task.name`: a robot of any tree has the task `pose`");
-    let terrain = error(&|config| config.sim.terrain = Terrain::SlopeRad(0.1));
-    assert!(terrain.contains("`sim.terrain`: the task `pose` is on flat ground"), "{terrain}");
-    let randomise = error(&|config| config.randomise.kp_scale = [0.9, 1.1]);
-    assert!(randomise.contains("`randomise`: robots of the task `pose` are not randomised yet"), "{randomise}");
-    let engine = error(&|config| config.sim.engine = Engine::Mujoco);
-    assert!(engine.contains("`batch` or `rapier` for a robot of any tree"), "{engine}");
+    let jump = error(&|config| config.task = TaskConfig::named("jump").unwrap());
+    assert_eq!(jump, "`task.name`: a robot of any tree has the tasks `pose` and `walk`");
+    let effects = error(&|config| config.randomise.effects = true);
+    assert!(effects.contains("`randomise.effects`: the intervals of a robot of any tree"), "{effects}");
+    let payload = error(&|config| config.randomise.payload_kg = [-20.0, 0.0]);
+    assert!(payload.contains("`randomise.payload_kg`"), "{payload}");
+    let terrain = error(&|config| {
+        config.sim.engine = Engine::Mujoco;
+        config.sim.terrain = Terrain::SlopeRad(0.1);
+    });
+    assert!(terrain.contains("`flat` in the engine `mujoco`"), "{terrain}");
     let weight = error(&|config| config.sim.physics_hz = Some(300));
     assert!(weight.contains("a multiple of the actuator rate"), "{weight}");
     let walk =

@@ -17,7 +17,7 @@ const MAY_USE: [(&str, &[&str]); 30] = [
     ("crates/logs", &["files", "model", "effects", "unitree"]),
     ("protocol", &["model"]),
     // Leaf crates.
-    ("crates/sim", &["simd", "model", "dynamics"]),
+    ("crates/sim", &["simd", "model", "dynamics", "robot-files"]),
     ("crates/envs", &["model", "effects"]),
     ("crates/identify", &["model", "dynamics", "effects", "logs"]),
     ("crates/diagnose", &["model", "dynamics", "effects", "logs", "identify", "inference"]),
@@ -181,6 +181,52 @@ fn large_libraries_are_used_only_by_their_crates() {
     }
 }
 
+/// Names of the shape of one robot: twelve joints, four legs.
+const QUADRUPED: [&str; 7] = ["NUM_JOINTS", "NUM_LEGS", "PerJoint", "PerLeg", "JOINT_NAMES", "JointKind", "Leg::"];
+
+/// Lines of code outside tests that may name the shape of the Go2, by crate. Every other crate serves any robot. `unitree` and `robot` are the
+/// Go2's own; diagnosis, its bench and `excite` are still for quadrupeds.
+const LINES_OF_QUADRUPEDS: [(&str, usize); 23] = [
+    ("crates/model", 136),
+    ("crates/dynamics", 21),
+    ("crates/robot-files", 20),
+    ("crates/effects", 34),
+    ("crates/unitree", 4),
+    ("crates/logs", 22),
+    ("protocol", 5),
+    ("crates/sim", 63),
+    ("crates/envs", 36),
+    ("crates/identify", 89),
+    ("crates/diagnose", 59),
+    ("crates/learning", 8),
+    ("crates/agent", 9),
+    ("crates/viewer", 3),
+    ("crates/robot", 111),
+    ("ensemble", 50),
+    ("env-server", 2),
+    ("crates/report", 18),
+    ("crates/inference", 8),
+    ("crates/hunt", 27),
+    ("crates/excite", 5),
+    ("crates/bench", 21),
+    ("crates/cli", 20),
+];
+
+#[test]
+fn crates_name_the_shape_of_the_go2_no_more_often_than_before() {
+    for (folder, _) in MAY_USE.into_iter().filter(|(folder, _)| *folder != "tests" && *folder != "examples") {
+        let mut found = BTreeMap::new();
+        modules(&root().join(folder).join("src"), &[], &mut found);
+        let names = |line: &str| QUADRUPED.iter().any(|name| line.contains(name)) || line.contains("; 12]");
+        let lines = found.values().flat_map(|code| code.lines()).filter(|line| names(line)).count();
+        let allowed = LINES_OF_QUADRUPEDS.iter().find(|(name, _)| *name == folder).map_or(0, |(_, allowed)| *allowed);
+        assert_eq!(
+            lines, allowed,
+            "{folder}: lines that name twelve joints or four legs; use the robot's own, or lower the number"
+        );
+    }
+}
+
 /// Path of a module in its crate; empty for the root.
 type Module = Vec<String>;
 
@@ -196,7 +242,8 @@ fn modules(folder: &Path, parent: &[String], found: &mut BTreeMap<Module, String
         } else if path.extension().is_some_and(|extension| extension == "rs") {
             let text = std::fs::read_to_string(&path).unwrap().replace("#[cfg(test)]\nmod tests;", "");
             let code = text.split("#[cfg(test)]").next().unwrap();
-            found.insert(module, code.lines().filter(|line| !line.trim_start().starts_with("//")).collect());
+            let lines = code.lines().filter(|line| !line.trim_start().starts_with("//"));
+            found.insert(module, lines.flat_map(|line| [line, "\n"]).collect());
         }
     }
 }

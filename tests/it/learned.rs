@@ -64,7 +64,7 @@ fn config(engine: Engine, model: &Path, threads: usize) -> Config {
     let mut config = remote::config(TaskConfig::default());
     (config.sim.engine, config.sim.threads) = (engine, threads);
     config.server.model = Some(model.to_owned());
-    remote::walk(&mut config).min_base_height_m = -1.0;
+    remote::walk(&mut config).min_base_height_m = Some(-1.0);
     remote::walk(&mut config).max_tilt_rad = 3.2;
     config
 }

@@ -327,14 +327,14 @@ fn output_that_is_no_reply_is_an_error() {
         reason(r"printf '\005\000\000\000Habcd'; exec sleep 9"),
         reason(r"printf '\002\000\000\000Da'; exec sleep 9"),
         reason(r"printf '\005\000\000\000Ha'"),
-        reason(r"printf '\023\000\000\000Htwinstep-mujoco 2 \002\000\000\000Da'; exec cat > /dev/null"),
+        reason(r"printf '\023\000\000\000Htwinstep-mujoco 3 \002\000\000\000Da'; exec cat > /dev/null"),
     ];
     expect![[r#"
         it wrote "Trac", which is not the start of a frame
-        it is another version: it wrote "abcd", not `twinstep-mujoco 2`
+        it is another version: it wrote "abcd", not `twinstep-mujoco 3`
         it wrote a frame of kind 'D' with 1 bytes as a reply
         it ended (exit status: 0); its messages are on stderr
-        the process of engine `mujoco` failed: it wrote the states of its robots in 1 bytes; 228 are expected; its robots are lost, create them again"#]].assert_eq(&reasons.join("\n"));
+        the process of engine `mujoco` failed: it wrote the states of its robots in 1 bytes; 244 are expected; its robots are lost, create them again"#]].assert_eq(&reasons.join("\n"));
 }
 
 #[test]

@@ -9,13 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from twinstep.mujoco.frames import (
-    COMMAND,
-    GROUND_TRUTH,
-    INITIAL_STATE,
     MAX_FRAME_BYTES,
-    MEASURED,
     FrameError,
     Hello,
+    Layout,
     Push,
     Reset,
     Step,
@@ -30,6 +27,8 @@ from twinstep.mujoco.frames import (
 )
 
 INDEX = st.integers(0, 2**32 - 1)
+NAMES = st.lists(st.text("ab c_0", min_size=1), max_size=4).map(tuple)
+QUADRUPED = Layout(tuple(f"joint{i}" for i in range(12)), tuple(f"geom{i}" for i in range(9)))
 
 
 @given(st.binary(min_size=1, max_size=1), st.binary(max_size=300))
@@ -57,18 +56,22 @@ def test_length_outside_its_range_is_rejected(length: int) -> None:
         read_frame(io.BytesIO(struct.pack("<I", length)))
 
 
-@given(INDEX, INDEX, INDEX, INDEX, st.text())
-def test_hello_is_parsed(robots: int, threads: int, iterations: int, steps: int, mjcf: str) -> None:
-    line = f"twinstep-mujoco 2 robots={robots} threads={threads} iterations={iterations} steps={steps}\n"
-    assert parse_hello((line + mjcf).encode()) == Hello(robots, threads, iterations, steps, mjcf)
+@given(INDEX, INDEX, INDEX, NAMES, NAMES, st.text())
+def test_hello_is_parsed(
+    robots: int, iterations: int, base: int, joints: tuple[str, ...], geoms: tuple[str, ...], mjcf: str
+) -> None:
+    line = f"twinstep-mujoco 3 robots={robots} threads=2 iterations={iterations} steps=5 base={base}"
+    names = "\t".join(joints) + "\n" + "\t".join(geoms)
+    hello = Hello(robots, 2, iterations, 5, base, Layout(joints, geoms), mjcf)
+    assert parse_hello(f"{line}\n{names}\n{mjcf}".encode()) == hello
 
 
 @pytest.mark.parametrize(
-    "line", [b"twinstep-mujoco 1 robots=1", b"other 1", b"", b"twinstep-mujoco 2 robots=1", b"\xff\xff"]
+    "line", [b"twinstep-mujoco 2 robots=1", b"other 1", b"", b"twinstep-mujoco 3 robots=1", b"\xff\xff"]
 )
 def test_hello_of_another_program_is_rejected(line: bytes) -> None:
     with pytest.raises(FrameError, match="the first request"):
-        parse_hello(line + b"\n<mujoco/>")
+        parse_hello(line + b"\na\nb\n<mujoco/>")
 
 
 def numbers(dtype: np.dtype[np.void], rows: int, seed: int) -> np.ndarray[tuple[int], np.dtype[np.void]]:
@@ -78,8 +81,8 @@ def numbers(dtype: np.dtype[np.void], rows: int, seed: int) -> np.ndarray[tuple[
 
 @given(st.lists(st.tuples(INDEX, st.text(max_size=20)), max_size=5), INDEX)
 def test_reset_is_parsed(robots: list[tuple[int, str]], seed: int) -> None:
-    resets = [Reset(robot, numbers(INITIAL_STATE, 1, seed), mjcf) for robot, mjcf in robots]
-    parsed = parse_reset(reset_body(resets))
+    resets = [Reset(robot, numbers(QUADRUPED.initial_state, 1, seed), mjcf) for robot, mjcf in robots]
+    parsed = parse_reset(reset_body(resets), QUADRUPED)
     assert [(reset.robot, reset.mjcf, reset.initial_state.tobytes()) for reset in parsed] == [
         (reset.robot, reset.mjcf, reset.initial_state.tobytes()) for reset in resets
     ]
@@ -88,8 +91,8 @@ def test_reset_is_parsed(robots: list[tuple[int, str]], seed: int) -> None:
 @given(st.integers(1, 9), INDEX, INDEX)
 def test_step_is_parsed(robots: int, periods: int, seed: int) -> None:
     active = np.random.default_rng(seed).random(robots) < 0.5
-    step = Step(periods, active, numbers(COMMAND, robots, seed))
-    parsed = parse_step(step_body(step), robots)
+    step = Step(periods, active, numbers(QUADRUPED.command, robots, seed))
+    parsed = parse_step(step_body(step), robots, QUADRUPED)
     assert parsed.periods == periods
     assert (parsed.active == active).all()
     assert parsed.commands.tobytes() == step.commands.tobytes()
@@ -101,14 +104,17 @@ def test_push_is_parsed() -> None:
 
 @given(st.binary(max_size=600), st.integers(1, 3))
 def test_any_other_body_is_a_frame_error(body: bytes, robots: int) -> None:
-    for parse in (parse_reset, lambda body: parse_step(body, robots), parse_push, parse_hello):
+    def reset(body: bytes) -> object:
+        return parse_reset(body, QUADRUPED)
+
+    for parse in (reset, lambda body: parse_step(body, robots, QUADRUPED), parse_push, parse_hello):
         try:
             parse(body)
         except FrameError:
             continue
-        assert parse is parse_reset or len(body) == (16 if parse is parse_push else 4 + robots * 241)
+        assert parse is reset or len(body) == (16 if parse is parse_push else 4 + robots * 241)
 
 
 def test_sizes_are_those_of_the_server() -> None:
-    sizes = [dtype.itemsize // 4 for dtype in (INITIAL_STATE, COMMAND, MEASURED, GROUND_TRUTH)]
-    assert sizes == [37, 60, 43, 14]
+    rows = (QUADRUPED.initial_state, QUADRUPED.command, QUADRUPED.measured, QUADRUPED.truth)
+    assert [row.itemsize // 4 for row in rows] == [37, 60, 43, 18]

@@ -13,12 +13,9 @@ from numpy.typing import NDArray
 
 import twinstep
 from twinstep.mujoco.frames import (
-    COMMAND,
-    GROUND_TRUTH,
-    INITIAL_STATE,
-    MEASURED,
     PROTOCOL,
     Hello,
+    Layout,
     Reset,
     Step,
     read_frame,
@@ -32,6 +29,11 @@ from twinstep.server import find_program
 POSE = np.tile([0.0, 0.8, -1.5], 4)
 WEIGHT = 15.206408 * 9.81
 STEPS = 5
+LEGS = ("FL", "FR", "RL", "RR")
+LAYOUT = Layout(
+    tuple(f"{leg}_{kind}" for leg in LEGS for kind in ("hip", "thigh", "calf")),
+    (*(f"{leg}_foot" for leg in LEGS), "trunk", *(f"{leg}_knee" for leg in LEGS)),
+)
 
 
 def exported(*flags: str) -> str:
@@ -44,7 +46,7 @@ def model() -> str:
 
 
 def initial_state(height: float) -> NDArray[np.void]:
-    state = np.zeros(1, INITIAL_STATE)
+    state = np.zeros(1, LAYOUT.initial_state)
     state["base_position"][0] = [0, 0, height]
     state["base_orientation"][0] = [2, 0, 0, 0]
     state["q"] = POSE
@@ -52,18 +54,18 @@ def initial_state(height: float) -> NDArray[np.void]:
 
 
 def hold(robots: int) -> NDArray[np.void]:
-    commands = np.zeros(robots, COMMAND)
+    commands = np.zeros(robots, LAYOUT.command)
     commands["q"], commands["kp"], commands["kd"] = POSE, 40, 1
     return commands
 
 
 def states(reply: bytes, robots: int) -> tuple[NDArray[np.void], NDArray[np.void]]:
-    measured = np.frombuffer(reply, MEASURED, robots)
-    return measured, np.frombuffer(reply, GROUND_TRUTH, robots, measured.nbytes)
+    measured = np.frombuffer(reply, LAYOUT.measured, robots)
+    return measured, np.frombuffer(reply, LAYOUT.truth, robots, measured.nbytes)
 
 
 def standing(model: str, robots: int, threads: int = 1) -> Robots:
-    created = Robots(Hello(robots, threads, 64, STEPS, model))
+    created = Robots(Hello(robots, threads, 64, STEPS, 1, LAYOUT, model))
     created.reset([Reset(robot, initial_state(0.33), "") for robot in range(robots)])
     return created
 
@@ -71,8 +73,8 @@ def standing(model: str, robots: int, threads: int = 1) -> Robots:
 def test_standing_robot_is_carried_by_its_feet(model: str) -> None:
     robots = standing(model, 1)
     measured, truth = states(robots.step(Step(400, np.ones(1, np.bool_), hold(1))), 1)
-    assert truth["foot_force"].sum() == pytest.approx(WEIGHT, rel=0.01)
-    assert truth["body_contact"][0] == 0
+    assert truth["geom_force"][0, :4].sum() == pytest.approx(WEIGHT, rel=0.01)
+    assert (truth["geom_force"][0, 4:] == 0).all()
     assert np.abs(measured["q"] - POSE).max() < 0.2
     assert np.linalg.norm(measured["orientation"]) == pytest.approx(1, abs=1e-6)
 
@@ -81,7 +83,7 @@ def test_torque_is_held_for_an_actuator_period_and_clipped(model: str) -> None:
     robots, commands = standing(model, 1), hold(1)
     commands["q"][0, 0] += 0.1
     commands["tau_ff"][0, 2] = 1000
-    start = np.frombuffer(robots.reset([Reset(0, initial_state(0.5), "")]), MEASURED, 1)
+    start = np.frombuffer(robots.reset([Reset(0, initial_state(0.5), "")]), LAYOUT.measured, 1)
     assert (start["q"] == POSE.astype("<f4")).all()
     measured, _ = states(robots.step(Step(1, np.ones(1, np.bool_), commands)), 1)
     # 40 N·m/rad times 0.1 rad, from the state at the start of the period.
@@ -133,13 +135,20 @@ def test_fixed_base_stays_where_it_is_placed() -> None:
     assert (truth["base_linear_velocity"] == 0).all()
 
 
+def test_joint_that_the_model_does_not_have_is_named(model: str) -> None:
+    layout = Layout(("knee",), ())
+    with pytest.raises(ModelError, match="the model has no joint or geom named 'knee'"):
+        Robots(Hello(1, 1, 64, STEPS, 1, layout, model))
+
+
 def test_invalid_model_is_rejected(model: str) -> None:
     with pytest.raises(ModelError, match="MuJoCo rejects the model of a robot"):
         standing(model, 1).reset([Reset(0, initial_state(0.33), "<mujoco><nonsense/></mujoco>")])
 
 
 def hello(model: str, version: int = PROTOCOL) -> bytes:
-    return f"twinstep-mujoco {version} robots=1 threads=1 iterations=64 steps={STEPS}\n{model}".encode()
+    names = "\t".join(LAYOUT.joints) + "\n" + "\t".join(LAYOUT.geoms)
+    return f"twinstep-mujoco {version} robots=1 threads=1 iterations=64 steps={STEPS} base=1\n{names}\n{model}".encode()
 
 
 @pytest.mark.parametrize(
@@ -181,7 +190,7 @@ def test_process_answers_in_lock_step_and_terminates_with_its_stdin(model: str, 
     assert process.stdout is not None
     assert process.stderr is not None
     write_frame(process.stdin, b"H", hello(model))
-    assert read_frame(process.stdout) == (b"H", f"twinstep-mujoco 2 mujoco={mujoco.__version__}".encode())
+    assert read_frame(process.stdout) == (b"H", f"twinstep-mujoco {PROTOCOL} mujoco={mujoco.__version__}".encode())
     commands = hold(1)
     commands["kp"] = np.inf
     for body in (step_body(Step(4, np.ones(1, np.bool_), hold(1))), step_body(Step(4, np.ones(1, np.bool_), commands))):

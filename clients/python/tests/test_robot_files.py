@@ -150,6 +150,13 @@ EQUAL = {
     ),
     "welded": change(("<freejoint/>", "")),
     "free joint by type": change(("<freejoint/>", '<joint type="free" armature="0" damping="0"/>')),
+    "free joint that inherits": change(("<freejoint/>", '<joint type="free" frictionloss="0.1"/>')),
+    "pairs": change(
+        (
+            "</worldbody>",
+            '</worldbody><contact><pair geom1="bar" geom2="floor"/><pair geom1="floor" geom2="bar"/></contact>',
+        )
+    ),
     "sites, cameras, lights": change(("<freejoint/>", '<freejoint/><site name="imu"/><camera name="eye"/><light/>')),
     "option": change(
         (
@@ -183,10 +190,9 @@ REFUSED = {
     "gravity": (change(("<default>\n", '<option gravity="0 0 -1.62"/>\n<default>\n')), "gravity"),
     "medium": (change(("<default>\n", '<option density="1000"/>\n<default>\n')), "density"),
     "disabled springs": (change(("<default>\n", '<option><flag spring="disable"/></option>\n<default>\n')), "spring"),
-    "friction of a free joint": (change(("<freejoint/>", '<joint type="free" damping="0"/>')), "armature"),
+    "spring of a free joint": (change(("<freejoint/>", '<joint type="free" stiffness="3"/>')), "stiffness"),
     "frame at the centre of mass": (change(("<freejoint/>", '<freejoint align="true"/>')), "align"),
     "actuator without a joint": (motor('<motor joint="wrist"/>'), "wrist"),
-    "contact pair": (change(("<actuator>", '<contact><pair geom1="floor" geom2="bar"/></contact><actuator>')), "<pair>"),
     "unknown attribute": (joint('stickiness="1"'), "stickiness"),
     "composite": (change(("<freejoint/>", '<freejoint/><composite type="cable"/>')), "<composite>"),
     "two robots": (change((RAIL, f"</body><body>  <freejoint/> {RAIL}")), "both move freely"),
@@ -307,7 +313,8 @@ def compare(original, copy) -> None:
             mujoco.mj_forward(model, data)
             mass = np.zeros((model.nv, model.nv))
             mujoco.mj_fullM(model, data, mass)
-            found.append((mass[np.ix_(dofs, dofs)], data.qfrc_bias[dofs], data.qfrc_passive[dofs]))
+            forces = (data.qfrc_bias[dofs], data.qfrc_passive[dofs], model.dof_frictionloss[dofs])
+            found.append((mass[np.ix_(dofs, dofs)], *forces))
         for one, other in zip(*found, strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * np.abs(one).max())
 
@@ -319,6 +326,29 @@ def test_mjcf_is_read_as_mujoco_compiles_it(name: str, tmp_path: Path) -> None:
     text, notes = exported(path)
     assert text, notes
     compare(mujoco.MjModel.from_xml_string(EQUAL[name]), mujoco.MjModel.from_xml_string(text))
+
+
+PAIRED = """<mujoco><default><geom contype="0" conaffinity="0"/></default><worldbody>
+  <body name="base"><freejoint/><inertial pos="0 0 0" mass="1" diaginertia="0.1 0.1 0.1"/>
+    <body><joint name="knee"/><inertial pos="0 0 0" mass="1" diaginertia="0.1 0.1 0.1"/>
+      <geom name="foot" type="sphere" size="0.123"/><geom name="hand" type="sphere" size="0.321"/></body>
+  </body>
+  <body name="ball" pos="1 0 0"><freejoint/><geom type="sphere" size="0.2" mass="1"/></body>
+  <body name="door" pos="2 0 0"><joint name="hinge"/><inertial pos="0 0 0" mass="1" diaginertia="0.1 0.1 0.1"/></body>
+</worldbody><actuator><motor name="knee" joint="knee"/></actuator>
+<contact><pair geom1="floor" geom2="foot"/><pair geom1="hand" geom2="foot"/></contact></mujoco>"""
+
+
+def test_objects_beside_a_robot_are_left_out_and_paired_shapes_touch_the_ground(tmp_path: Path) -> None:
+    path = tmp_path / "robot.xml"
+    path.write_text(PAIRED)
+    text, notes = exported(path)
+    model = mujoco.MjModel.from_xml_string(text)
+    assert [model.joint(j).name for j in range(1, model.njnt)] == ["knee"]
+    assert "0.123" in text
+    assert "0.321" not in text
+    for note in ("body `ball` has no actuator", "body `door` has no actuator", "contacts between shapes of the robot"):
+        assert note in notes
 
 
 @pytest.mark.parametrize("name", REFUSED)

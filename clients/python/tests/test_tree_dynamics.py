@@ -24,7 +24,7 @@ def numbers(values: Array) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 
-def random_robot(random: np.random.Generator) -> str:
+def random_robot(random: np.random.Generator, inherits: bool = True) -> str:
     """Return an MJCF robot of 5 to 40 joints with any axes and frames, a third of them slides."""
     count = int(random.integers(5, 41))
     children: dict[int, list[int]] = {}
@@ -42,7 +42,8 @@ def random_robot(random: np.random.Generator) -> str:
     def body(index: int) -> str:
         place, turn = random.uniform(-0.3, 0.3, 3), random.normal(size=4)
         if index == 0:
-            joint = "<freejoint/>" if random.random() < 0.5 else ""
+            inherited = f'<joint type="free" armature="{random.uniform(0, 0.3)}" damping="{random.uniform(0, 0.5)}"/>'
+            joint = ("<freejoint/>", inherited if inherits else "<freejoint/>", "", "")[random.integers(4)]
         else:
             kind = "slide" if random.random() < 1 / 3 else "hinge"
             axis, at = random.normal(size=3), random.uniform(-0.05, 0.05, 3)

@@ -147,11 +147,34 @@ BALL_ON_A_TILTED_BASE = """
 """Three joints on a body, which are joints of bodies without mass in the tree."""
 
 
+def test_free_joint_with_friction_moves_as_in_mujoco(tmp_path: Path) -> None:
+    path = tmp_path / "robot.xml"
+    free = '<joint type="free" armature="0.2" damping="0.3" frictionloss="0.5"/>'
+    path.write_text(BALL_ON_A_TILTED_BASE.replace("<inertial", free + "<inertial", 1))
+    robot = Robot(path)
+    start = robot.start(np.array([0.3, -0.2, 0.1]))
+    # The fast axes slide, the slow one comes to rest.
+    start |= {"linear_velocity": [1.0, 0.05, 0.0], "angular_velocity": [0.0, 0.02, -3.0]}
+    theirs = robot.data(start)
+    for _ in range(PHYSICS_HZ // 2):
+        mujoco.mj_step(robot.model, theirs)
+    end = robot.ours(start, (0.0, 0.0), np.zeros((PERIODS // 2, robot.joints)))[-1]
+    np.testing.assert_allclose(end["linear_velocity"], theirs.qvel[:3], atol=2e-3)
+    np.testing.assert_allclose(end["angular_velocity"], theirs.qvel[3:6], atol=2e-2)
+    without = Robot(path)
+    without.model.dof_frictionloss[:6] = 0
+    free_fall = without.data(start)
+    for _ in range(PHYSICS_HZ // 2):
+        mujoco.mj_step(without.model, free_fall)
+    assert np.abs(free_fall.qvel[:6] - theirs.qvel[:6]).max() > 0.2, "the friction makes a difference"
+
+
 @pytest.mark.parametrize("seed", [None, *range(8)])
 def test_both_engines_follow_commands_as_mujoco_does(seed: int | None, tmp_path: Path) -> None:
     random = np.random.default_rng(seed or 0)
     path = tmp_path / "robot.xml"
-    path.write_text(BALL_ON_A_TILTED_BASE if seed is None else random_robot(random))
+    # rapier has no inertia and friction of a free joint.
+    path.write_text(BALL_ON_A_TILTED_BASE if seed is None else random_robot(random, inherits=False))
     robot, gains = Robot(path), (5.0, 0.5)
     q = random.uniform(-0.5, 0.5, robot.joints)
     start = robot.start(q)

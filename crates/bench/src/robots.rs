@@ -108,6 +108,7 @@ impl Motion {
 
     fn setup(&self, window_s: f64) -> Setup {
         let options = TreeMjcf {
+            contact: self.model.contact,
             timestep: 1.0 / f64::from(PHYSICS_HZ),
             actuator: MjcfActuator::Position { kp: self.gains[0].into(), kd: self.gains[1].into() },
             start: Some(self.pose.clone()),

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
-use twinstep_envs::{JumpConfig, ObservationNoise, Randomisation, TaskConfig};
+use twinstep_envs::{ControlledRobot, JumpConfig, ObservationNoise, Randomisation, TaskConfig};
 use twinstep_learning::{Evaluation, EvaluationError, EvaluationPlan, SpeedBin, evaluate};
 use twinstep_model::{EnvError, EnvSpec, ResetRequest, VecEnv};
 use twinstep_policy::{Policy, PolicyRunner};
@@ -217,8 +217,9 @@ fn json(args: &Args, rows: &impl Serialize) -> String {
 
 /// Evaluates the policy by velocity commands under each condition.
 fn walking(args: &Args, policy: &Policy, signals: &Signals) -> Result<Vec<Row>, Failure> {
-    let robot = TrainConfig { model: args.model.clone(), ..TrainConfig::default() }.quadruped()?;
-    let plan = EvaluationPlan { robot: &robot, seconds: args.seconds, seed: args.seed };
+    let robot = TrainConfig { model: args.model.clone(), ..TrainConfig::default() }.robots(1)?.control();
+    let ControlledRobot { feet, torque_limits, .. } = &robot;
+    let plan = EvaluationPlan { feet, torque_limits, seconds: args.seconds, seed: args.seed };
     let mut rows = Vec::new();
     for condition in args.conditions() {
         let mut env = condition.env(args, TaskConfig::default(), args.robots as usize)?;

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use twinstep_effects::is_robot_file;
 use twinstep_model::{BaseMount, MjcfOptions, RobotTree, go2, mjcf};
 use twinstep_robot_files::{QuadrupedNames, TreeMjcf, quadruped, read_robot, write_mjcf};
+use twinstep_sim::effect_outside_mujoco;
 
 use crate::exit::{CommandResult, Failure, input, other};
 use crate::robot_file::robot_model;
@@ -84,8 +85,11 @@ fn of_model_file(path: Option<&Path>, options: &MjcfOptions) -> Result<String, F
         Ok(robot) => return Ok(mjcf(&robot, options)),
         Err(refused) => refused,
     };
-    let tree = of_any_tree(path).ok().and_then(|file| file.tree_model().ok()).ok_or(refused)?.tree;
-    Ok(of_tree(tree, options))
+    let robot = of_any_tree(path).ok().and_then(|file| file.tree_model().ok()).ok_or(refused)?;
+    if let Some(effect) = effect_outside_mujoco(&robot.joints) {
+        eprintln!("note: `{effect}` of the model file is left out, because MuJoCo has no such joint");
+    }
+    Ok(of_tree(robot.plain_tree(), options))
 }
 
 fn of_tree(mut tree: RobotTree, options: &MjcfOptions) -> String {

@@ -9,7 +9,9 @@ use std::time::{Duration, Instant};
 use glam::Quat;
 use indicatif::{ProgressBar, ProgressStyle};
 use twinstep_agent::read_contract;
-use twinstep_env_server::{Config, EnvFactory, Server, ServerConfig, ServerError, SimEnvFactory, TreeEnvFactory};
+use twinstep_env_server::{
+    AnyEnvFactory, Config, EnvFactory, Server, ServerConfig, ServerError, SimEnvFactory, TreeEnvFactory,
+};
 use twinstep_envs::TaskConfig;
 use twinstep_model::{AutoresetMode, InitialState, Pose, ResetRequest, RobotModel, Scene};
 use twinstep_sim::{Engine, SimConfig};
@@ -109,15 +111,12 @@ pub fn run(args: &Args) -> CommandResult {
     let is_orphan = args.until_stdin_closes.then(OrphanCheck::new);
     let config = args.config()?;
     let signals = Signals::listen_unhurried()?;
-    if let TaskConfig::Pose(_) = config.task {
-        let factory = TreeEnvFactory::new(&config).map_err(input)?;
-        let name = config.server.name_of(factory.robot_name());
-        let scene = tree_scene(&name, &factory)?;
-        return show_and_serve(args, &config, &name, factory, scene, &signals, is_orphan.as_ref());
-    }
-    let factory = SimEnvFactory::new(config.clone()).map_err(input)?;
-    let name = config.server.name_of(&factory.robot().name);
-    let scene = scene(&config, factory.robot());
+    let factory = AnyEnvFactory::new(config.clone()).map_err(input)?;
+    let name = config.server.name_of(&factory.control().name);
+    let scene = match &factory {
+        AnyEnvFactory::Quadruped(factory) => scene(&config, factory.robot()),
+        AnyEnvFactory::Tree(factory) => tree_scene(&name, factory)?,
+    };
     show_and_serve(args, &config, &name, factory, scene, &signals, is_orphan.as_ref())
 }
 

@@ -11,7 +11,7 @@ use twinstep_policy::{Collector, CurvePoint, Mlp, Policy, PolicyOrigin, StepColl
 use twinstep_viewer::LearningPoint;
 
 use crate::exit::{CommandResult, Failure, Signals, input, other};
-use crate::train_config::TrainConfig;
+use crate::train_config::{TrainConfig, scene_info};
 use crate::train_endpoints::remote_collectors;
 use crate::train_evaluation;
 use crate::train_log::{TrainLog, curve_point, write_curve};
@@ -224,9 +224,6 @@ impl Args {
                 )));
             }
             config.task = TaskConfig::named(task).expect("the argument was checked");
-            if let (TaskConfig::Pose(_), None) = (&config.task, &self.config) {
-                config.sim.physics_hz = None;
-            }
         }
         match (&mut config.task, &self.base) {
             (TaskConfig::Explore(explore), base) => {
@@ -248,6 +245,9 @@ impl Args {
         }
         // The folder may be used from another working directory.
         config.model = self.model.clone().or(config.model).map(|path| path.canonicalize().unwrap_or(path));
+        if config.has_tree() && self.config.is_none() {
+            config.sim.physics_hz = None;
+        }
         config.randomise.effects |= self.randomise_effects;
         if let Some(envs) = self.envs {
             (config.train.num_envs, config.train.groups) = (envs, config.train.groups.min(envs.max(1)));
@@ -286,7 +286,7 @@ fn open_page(args: &Args, config: &TrainConfig) -> Result<Option<Page>, Failure>
     let mut example = config.envs(1, 1, 1)?.remove(0);
     let robots = config.robots(1)?;
     let title = format!("twinstep train {}", config.task.name());
-    args.view.open(example.as_mut(), |scene| robots.scene_info(title, scene))
+    args.view.open(example.as_mut(), |scene| scene_info(&robots, title, scene))
 }
 
 /// Returns a point of the learning curve as a page shows it.

@@ -3,7 +3,9 @@
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
-use twinstep_env_server::{Config, ConfigFileError, EnvFactory, ServerConfig, SimEnvFactory, TreeEnvFactory};
+use twinstep_env_server::{
+    AnyEnvFactory, Config, ConfigFileError, EnvFactory, ServerConfig, SimEnvFactory, is_of_tree,
+};
 use twinstep_envs::{Randomisation, TaskConfig};
 use twinstep_learning::PpoConfig;
 use twinstep_model::{AutoresetMode, RobotModel, Scene, VecEnv};
@@ -53,10 +55,15 @@ impl TrainConfig {
             .map_err(|source| input(ConfigFileError::Unreadable { path: path.to_owned(), source }))?;
         let mut config = Self::parse(&text, &path.display().to_string())?;
         // The rate was measured with quadrupeds; other robots have the engine's own.
-        if config.sim.engine == Engine::Batch && !matches!(config.task, TaskConfig::Pose(_)) {
+        if config.sim.engine == Engine::Batch && !config.has_tree() {
             config.sim.physics_hz.get_or_insert(TRAINING_PHYSICS_HZ);
         }
         Ok(config)
+    }
+
+    /// Returns true if the robots are simulated as a tree.
+    pub fn has_tree(&self) -> bool {
+        matches!(self.task, TaskConfig::Pose(_)) || self.model.as_deref().is_some_and(is_of_tree)
     }
 
     /// Parses the text of a config file. Errors refer to the file as `name`.
@@ -72,8 +79,7 @@ impl TrainConfig {
 
     /// Builds `groups` batches of environments, `num_envs` in total, that are stepped by `threads` threads each.
     pub fn envs(&self, num_envs: usize, groups: usize, threads: usize) -> Result<Vec<Box<dyn VecEnv>>, Failure> {
-        let robots = self.robots(threads)?;
-        let factory = robots.factory();
+        let factory = self.robots(threads)?;
         (0..groups)
             .map(|group| {
                 let robots = num_envs / groups + usize::from(group < num_envs % groups);
@@ -88,12 +94,8 @@ impl TrainConfig {
     }
 
     /// Returns the robots with this number of threads.
-    pub fn robots(&self, threads: usize) -> Result<Robots, Failure> {
-        let config = self.of_server(threads)?;
-        Ok(match config.task {
-            TaskConfig::Pose(_) => Robots::Tree(Box::new(TreeEnvFactory::new(&config).map_err(input)?)),
-            _ => Robots::Quadruped(Box::new(SimEnvFactory::new(config).map_err(input)?)),
-        })
+    pub fn robots(&self, threads: usize) -> Result<AnyEnvFactory, Failure> {
+        AnyEnvFactory::new(self.of_server(threads)?).map_err(input)
     }
 
     fn of_server(&self, threads: usize) -> Result<Config, Failure> {
@@ -109,29 +111,11 @@ impl TrainConfig {
     }
 }
 
-/// Robots that learn.
-pub enum Robots {
-    /// Quadrupeds like the Go2.
-    Quadruped(Box<SimEnvFactory>),
-    /// Robots of any tree.
-    Tree(Box<TreeEnvFactory>),
-}
-
-impl Robots {
-    /// Returns what builds their environments.
-    pub fn factory(&self) -> &dyn EnvFactory {
-        match self {
-            Self::Quadruped(factory) => &**factory,
-            Self::Tree(factory) => &**factory,
-        }
-    }
-
-    /// Describes a scene of one of them.
-    pub fn scene_info(&self, title: impl Into<String>, scene: &Scene) -> SceneInfo {
-        match self {
-            Self::Quadruped(factory) => SceneInfo::new(title, scene, factory.robot()),
-            Self::Tree(factory) => SceneInfo::of_tree(title, scene, factory.tree()),
-        }
+/// Describes a scene of a robot.
+pub fn scene_info(robots: &AnyEnvFactory, title: impl Into<String>, scene: &Scene) -> SceneInfo {
+    match robots {
+        AnyEnvFactory::Quadruped(factory) => SceneInfo::new(title, scene, factory.robot()),
+        AnyEnvFactory::Tree(factory) => SceneInfo::of_tree(title, scene, factory.tree()),
     }
 }
 

@@ -62,8 +62,8 @@ fn walking(
     signals: &Signals,
 ) -> Result<Evaluation, Failure> {
     let fresh = fresh(config, config.task.with_default_settings());
-    let robot = fresh.quadruped()?;
-    let plan = EvaluationPlan { robot: &robot, seconds: SECONDS, seed: SEED };
+    let robot = fresh.robots(1)?.control();
+    let plan = EvaluationPlan { feet: &robot.feet, torque_limits: &robot.torque_limits, seconds: SECONDS, seed: SEED };
     let proceed = |_: f64| signals.check().is_ok();
     let failure = |error| match error {
         EvaluationError::Stopped => Failure::Interrupted,

@@ -2,7 +2,8 @@
 
 use std::path::Path;
 
-use twinstep_effects::{ModelFile, ModelFileError, NominalGain, NominalRobotError, TreeModelFile};
+use twinstep_effects::{NominalGain, TreeModelFile};
+use twinstep_env_server::is_of_tree;
 use twinstep_inference::JointLog;
 use twinstep_logs::Log;
 use twinstep_logs::replay::check_gains;
@@ -24,14 +25,7 @@ pub fn tree_model(path: Option<&Path>, log: &Log) -> Result<Option<TreeModelFile
         gains.map_err(input)?;
     }
     let Some(path) = path else { return Ok(unknown_gains.then(TreeModelFile::go2)) };
-    let is_tree = unknown_gains
-        || match ModelFile::load(path) {
-            Err(ModelFileError::OfTree { .. }) => true,
-            Err(ModelFileError::Robot { cause, .. }) => matches!(*cause, NominalRobotError::Import { .. }),
-            // The caller says what is wrong with the file of a quadruped.
-            _ => false,
-        };
-    if is_tree { of_any_tree(Some(path)).map(Some) } else { Ok(None) }
+    if unknown_gains || is_of_tree(path) { of_any_tree(Some(path)).map(Some) } else { Ok(None) }
 }
 
 /// Returns the model of a tree, also for a quadruped; the ideal Go2 for `None`.

@@ -200,7 +200,7 @@ impl U2eConfig {
         // Before the robot moves: what `[actuator]` will reject after the first log.
         let robot = model.robot_model().map_err(input)?;
         check_effects(&model, TorqueSensor::MotorCurrent).map_err(|error| wrong(format!("`model`: {error}")))?;
-        config.randomise.check_robot(&robot).map_err(|error| wrong(error.to_string()))?;
+        config.randomise.check_base(robot.trunk.mass).map_err(|error| wrong(error.to_string()))?;
         if let Some(log) = &config.held_out {
             open_log::open_log(log)?;
         }

@@ -61,6 +61,14 @@ impl<T: SimdFloat, J: JointValues<T>> State<T, J> {
 }
 
 impl<T: SimdFloat, J> State<T, J> {
+    /// Returns the velocity of the base in base axes: angular [rad/s], then linear of its origin [m/s].
+    #[inline(always)]
+    pub fn base_velocity(&self) -> [T; 6] {
+        let (axes, Vec3([p, q, r]), v) = (self.world_axes(), self.angular_velocity, self.linear_velocity);
+        let along = |axis: usize| axes[0].0[axis] * v.0[0] + axes[1].0[axis] * v.0[1] + axes[2].0[axis] * v.0[2];
+        [p, q, r, along(0), along(1), along(2)]
+    }
+
     /// Returns the axes of the world frame in base coordinates.
     #[inline(always)]
     pub fn world_axes(&self) -> [Vec3<T>; 3] {

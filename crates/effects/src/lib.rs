@@ -29,7 +29,7 @@ pub use demo::{DemoMotion, EffectDemo, PlotQuantity};
 pub use entry::{EffectEntry, EntryError, apply_effects};
 pub use model_file::{
     ActuatorNetworkConfig, EffectEntryError, JointEffect, JointScope, MemberSampling, ModelFile, ModelFileError,
-    NetworkMode, NominalGain, TreeModelFile, load_robot, parse_robot,
+    NetworkMode, NominalGain, ShapeText, TreeGroups, TreeModelFile, load_robot, parse_robot,
 };
 pub use nominal::{ControlTable, JointGains, JointsTable, KindGains, NominalRobot, NominalRobotError, is_robot_file};
 pub use sampler::{RobotSampler, SamplingError};

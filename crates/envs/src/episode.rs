@@ -1,8 +1,7 @@
 //! Episode of one environment: random numbers, actions and sums of rewards, for any task.
 
 use rand::Rng;
-use twinstep_effects::RobotSampler;
-use twinstep_model::{ControlConfig, NUM_JOINTS, PerJoint, RobotModel, Stream, stream};
+use twinstep_model::{Stream, stream};
 
 use crate::Randomisation;
 use crate::task::{RobotView, Step, Task};
@@ -35,19 +34,19 @@ pub struct Episode<S> {
     /// Sum of each weighted reward term so far.
     pub term_sums: Vec<f32>,
     /// Last action, clipped.
-    pub action: PerJoint,
-    previous_action: PerJoint,
-    previous_dq: PerJoint,
+    pub action: Vec<f32>,
+    previous_action: Vec<f32>,
+    previous_dq: Vec<f32>,
 }
 
 /// Random values of a new episode.
-pub struct EpisodeStart {
+pub struct EpisodeStart<R> {
     /// The robot of the episode. `None`: that of the backend.
-    pub robot: Option<RobotModel>,
+    pub robot: Option<R>,
     /// Seed of the random numbers in the actuators.
     pub actuator_seed: u64,
     /// Joint position [rad].
-    pub q: PerJoint,
+    pub q: Vec<f32>,
 }
 
 /// Reward and end flags of a policy step.
@@ -65,6 +64,7 @@ impl<S: Default> Episode<S> {
     /// Creates an environment of `task` without an episode, whose random numbers come from `seed`.
     pub fn not_started(task: &impl Task<State = S>, seed: u64) -> Self {
         let spec = task.spec();
+        let joints = spec.action_len();
         Self {
             state: S::default(),
             random: stream(seed, &spec.task, 0),
@@ -79,9 +79,9 @@ impl<S: Default> Episode<S> {
             episode_return: 0.0,
             terms: vec![0.0; spec.reward_terms.len()],
             term_sums: vec![0.0; spec.reward_terms.len()],
-            action: [0.0; NUM_JOINTS],
-            previous_action: [0.0; NUM_JOINTS],
-            previous_dq: [0.0; NUM_JOINTS],
+            action: vec![0.0; joints],
+            previous_action: vec![0.0; joints],
+            previous_dq: vec![0.0; joints],
         }
     }
 
@@ -108,14 +108,15 @@ impl<S: Default> Episode<S> {
         self.length > 0
     }
 
-    /// Starts a new episode: resets the sums and samples robot, pose and the state of the task.
-    pub fn start(
+    /// Starts a new episode: resets the sums, and samples robot, pose and the state of the task.
+    ///
+    /// `sample` returns the robot of the episode, from random numbers of its effects, and from those of everything else.
+    pub fn start<R>(
         &mut self,
         task: &impl Task<State = S>,
-        nominal: &RobotModel,
         randomise: &Randomisation,
-        sampler: Option<&RobotSampler>,
-    ) -> EpisodeStart {
+        sample: impl FnOnce(&mut Stream, &mut Stream) -> Option<R>,
+    ) -> EpisodeStart<R> {
         // Separate streams: poses and commands do not depend on whether effects, actuators, noise and pushes use random
         // numbers.
         let mut effects = stream(self.seed, "effects", self.episode_index);
@@ -123,8 +124,7 @@ impl<S: Default> Episode<S> {
         self.noise = stream(self.seed, "noise", self.episode_index);
         self.pushes = stream(self.seed, "push", self.episode_index);
         self.steps_to_push = randomise.sample_push_steps(task.spec().policy_dt, &mut self.pushes);
-        let sampled = sampler.map(|sampler| sampler.sample(&mut effects));
-        let robot = randomise.sample(sampled.as_ref().unwrap_or(nominal), &mut self.random).or(sampled);
+        let robot = sample(&mut effects, &mut self.random);
         let (q, state) = task.start(&mut self.random);
         self.state = state;
         self.episode_index += 1;
@@ -133,7 +133,7 @@ impl<S: Default> Episode<S> {
         self.episode_return = 0.0;
         self.terms.fill(0.0);
         self.term_sums.fill(0.0);
-        self.action = [0.0; NUM_JOINTS];
+        self.action.fill(0.0);
         EpisodeStart { robot, actuator_seed, q }
     }
 
@@ -147,13 +147,13 @@ impl<S: Default> Episode<S> {
         Some(randomise.sample_push(&mut self.pushes))
     }
 
-    /// Stores the action before a step and returns the commanded joint positions [rad].
-    pub fn joint_targets(&mut self, control: &ControlConfig, action: &PerJoint, dq: &PerJoint) -> PerJoint {
-        let scale = control.action_scale as f32;
-        self.previous_action = self.action;
-        self.action = action.map(|value| value.clamp(-1.0, 1.0));
-        self.previous_dq = *dq;
-        std::array::from_fn(|j| control.default_pose[j] as f32 + scale * self.action[j])
+    /// Stores the action before a step, clipped, and the joint velocities.
+    pub fn act(&mut self, action: &[f32], dq: &[f32]) {
+        std::mem::swap(&mut self.previous_action, &mut self.action);
+        for (own, value) in self.action.iter_mut().zip(action) {
+            *own = value.clamp(-1.0, 1.0);
+        }
+        self.previous_dq.copy_from_slice(dq);
     }
 
     /// Returns the reward and the end flags after a step of `robot`.

@@ -1,15 +1,15 @@
 //! Motion and contact of the feet, for reward terms.
 
 use glam::Vec3;
-use twinstep_model::{FootKinematics, GroundTruth, PerLeg, frames};
+use twinstep_model::{Feet, FootMotion, PerLeg, frames};
 
-use crate::task::RobotView;
+use crate::task::{RobotView, Truth};
 
 /// Contact force above which a foot is on the ground [N].
 const CONTACT_FORCE_THRESHOLD: f32 = 1.0;
 
 /// Motion of a foot in the world frame.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct FootState {
     /// Height of the foot's centre above the ground under it [m].
     pub height: f32,
@@ -19,14 +19,13 @@ pub struct FootState {
     pub vertical_velocity: f32,
 }
 
-/// Returns the motion of the feet of a simulated robot in the order FL, FR, RL, RR.
-pub fn foot_states(kinematics: &FootKinematics, robot: &RobotView, truth: &GroundTruth) -> [FootState; 4] {
-    let (measured, index) = (robot.measured, robot.index);
-    let world_from_base = frames::world_from_base(measured.orientation[index]);
-    let base_position = Vec3::from(truth.base_position[index]);
-    let base_velocity = Vec3::from(truth.base_linear_velocity[index]);
-    let angular_velocity = Vec3::from(truth.base_angular_velocity[index]);
-    kinematics.feet(&measured.q[index], &measured.dq[index]).map(|foot| {
+/// Returns the motion of the feet of a simulated robot.
+pub fn foot_states(feet: &Feet, robot: &RobotView, truth: &Truth) -> Vec<FootState> {
+    let world_from_base = frames::world_from_base(robot.orientation);
+    let base_position = Vec3::from(truth.base_position);
+    let base_velocity = Vec3::from(truth.base_linear_velocity);
+    let angular_velocity = Vec3::from(truth.base_angular_velocity);
+    let state = |foot: FootMotion| {
         let position = base_position + world_from_base * foot.position;
         let velocity = base_velocity + world_from_base * (foot.velocity + angular_velocity.cross(foot.position));
         FootState {
@@ -34,41 +33,56 @@ pub fn foot_states(kinematics: &FootKinematics, robot: &RobotView, truth: &Groun
             horizontal_speed: velocity.x.hypot(velocity.y),
             vertical_velocity: velocity.z,
         }
-    })
+    };
+    feet.motions(robot.q, robot.dq).map(state).collect()
+}
+
+/// Returns a value for each of the four feet of a quadruped.
+pub fn per_leg(values: impl IntoIterator<Item = f32>) -> PerLeg {
+    let mut values = values.into_iter();
+    std::array::from_fn(|_| values.next().expect("a quadruped has four feet"))
 }
 
 /// Contacts of the feet over the policy steps of an episode.
 ///
 /// A foot counts as on the ground if it touches it in this or in the last step: contact flickers, and the force is that
 /// of the last physics step only.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Debug, Default)]
 pub struct FootContacts {
-    touched: [bool; 4],
-    on_ground: [bool; 4],
-    air_time: PerLeg,
-    touchdown_air_time: PerLeg,
+    touched: Vec<bool>,
+    on_ground: Vec<bool>,
+    air_time: Vec<f32>,
+    touchdown_air_time: Vec<f32>,
 }
 
 impl FootContacts {
     /// Updates the contacts after a policy step with the normal force on each foot [N].
-    pub fn update(&mut self, foot_force: &PerLeg, policy_dt: f32) {
-        for (leg, force) in foot_force.iter().enumerate() {
+    pub fn update(&mut self, foot_force: &[f32], policy_dt: f32) {
+        self.resize(foot_force.len());
+        for (foot, force) in foot_force.iter().enumerate() {
             let touches = *force > CONTACT_FORCE_THRESHOLD;
-            self.on_ground[leg] = touches || self.touched[leg];
-            self.touched[leg] = touches;
-            self.touchdown_air_time[leg] = if self.on_ground[leg] { self.air_time[leg] } else { 0.0 };
-            self.air_time[leg] = if self.on_ground[leg] { 0.0 } else { self.air_time[leg] + policy_dt };
+            self.on_ground[foot] = touches || self.touched[foot];
+            self.touched[foot] = touches;
+            self.touchdown_air_time[foot] = if self.on_ground[foot] { self.air_time[foot] } else { 0.0 };
+            self.air_time[foot] = if self.on_ground[foot] { 0.0 } else { self.air_time[foot] + policy_dt };
         }
     }
 
-    /// Returns whether each foot is on the ground.
-    pub fn on_ground(&self) -> [bool; 4] {
-        self.on_ground
+    fn resize(&mut self, feet: usize) {
+        self.touched.resize(feet, false);
+        self.on_ground.resize(feet, false);
+        self.air_time.resize(feet, 0.0);
+        self.touchdown_air_time.resize(feet, 0.0);
+    }
+
+    /// Returns whether each foot is on the ground; empty before the first step.
+    pub fn on_ground(&self) -> &[bool] {
+        &self.on_ground
     }
 
     /// Returns the air time of each foot that touched down in the last step, 0 for the others [s].
-    pub fn touchdown_air_time(&self) -> PerLeg {
-        self.touchdown_air_time
+    pub fn touchdown_air_time(&self) -> &[f32] {
+        &self.touchdown_air_time
     }
 }
 
@@ -102,10 +116,10 @@ mod tests {
         states.truth.base_linear_velocity[0] = [0.4, 0.0, 0.0];
         states.truth.base_angular_velocity[0] = [0.0, 0.0, 1.0];
         let ground = Ground::FLAT;
-        let view = RobotView { measured: &states.measured, truth: Some(&states.truth), ground: &ground, index: 0 };
-        let kinematics = FootKinematics::new(&robot);
-        let feet = foot_states(&kinematics, &view, &states.truth);
-        let relative = kinematics.feet(&states.measured.q[0], &states.measured.dq[0]);
+        let view = RobotView::of(&states.measured, Some(&states.truth), &ground, 0);
+        let kinematics = Feet::from(&robot);
+        let feet = foot_states(&kinematics, &view, &view.truth.expect("a simulator"));
+        let relative = kinematics.motions(&states.measured.q[0], &states.measured.dq[0]);
         for (foot, motion) in feet.iter().zip(relative) {
             // Velocity of a point of a rigid body: v + omega x r.
             let expected = (0.4 - motion.position.y).hypot(motion.position.x);

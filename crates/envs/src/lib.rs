@@ -2,6 +2,7 @@
 //!
 //! - [`Task`]: what a policy and a critic observe, the reward terms, and the end of an episode. [`tasks`] has one file
 //!   per task; [`TaskConfig`] is the `[task]` table of a config file.
+//! - [`ControlledRobot`]: the robot as tasks see it, of any tree: its joints, gains and pose, its feet and its size.
 //! - [`TaskEnv`]: a task on all robots of a backend, as a [`twinstep_model::VecEnv`].
 //! - [`Path`]: a reference that moves along arcs on the ground, for the task `track`.
 //! - [`Randomisation`]: the `[randomise]` table; each episode has its own robot, is pushed, and observes with
@@ -13,6 +14,7 @@
 
 mod check;
 mod config;
+mod controlled_robot;
 mod counter;
 mod episode;
 mod feet;
@@ -28,14 +30,16 @@ pub mod trot;
 
 pub use check::{CheckError, check_vec_env};
 pub use config::{ConfigError, over_defaults};
+pub use controlled_robot::ControlledRobot;
 pub use counter::{Counter, CounterEnv};
+pub use episode::{Episode, EpisodeStart, StepOutcome};
 pub use observation::{CRITIC_OBS_LEN, OBS_LEN, base_spec, observe, observe_privileged, privileged_fields};
-pub use observation_noise::ObservationNoise;
+pub use observation_noise::{NoisyEntry, ObservationNoise, add_noise};
 pub use path::{GroundPose, Path, PathShape};
 pub use randomise::Randomisation;
-pub use task::{RobotView, Step, Task};
+pub use task::{RobotView, Step, Task, Truth};
 pub use task_env::{TaskEnv, TaskEnvConfig};
 pub use tasks::{
-    Attitude, AttitudeConfig, ControlledRobot, ExploreConfig, Gait, GaitConfig, GaitTask, Jump, JumpConfig, PoseConfig,
-    PoseState, PoseTask, TaskConfig, Track, TrackConfig, TreeView, Walk, WalkConfig, roll_and_pitch,
+    Attitude, AttitudeConfig, ExploreConfig, Gait, GaitConfig, GaitTask, Jump, JumpConfig, PoseConfig, PoseState,
+    PoseTask, TaskConfig, Track, TrackConfig, Walk, WalkConfig, roll_and_pitch,
 };

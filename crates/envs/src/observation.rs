@@ -1,47 +1,62 @@
 //! Observation and action entries that tasks share: U2E, eq. 14, and privileged entries for a critic.
 
 use glam::Vec3;
-use twinstep_model::{EnvSpec, GroundTruth, JOINT_NAMES, NUM_JOINTS, PerJoint, RobotModel, SpecField, frames};
+use twinstep_model::{EnvSpec, RobotModel, SpecField, frames};
 
-use crate::task::RobotView;
+use crate::ControlledRobot;
+use crate::task::{RobotView, Truth};
 
-/// Length of the observation of U2E, eq. 14.
+/// Length of the observation of U2E, eq. 14, of a quadruped with twelve joints.
 pub const OBS_LEN: usize = 45;
-/// Length of the privileged observation.
+/// Length of the privileged observation of a quadruped.
 pub const CRITIC_OBS_LEN: usize = 11;
 
 /// Returns the spec of a task with the observation of U2E, eq. 14, and joint position offsets as actions.
 ///
 /// `reward_terms` are the names of the terms, `max_episode_s` is the time after which an episode is truncated [s].
 pub fn base_spec(task: &str, robot: &RobotModel, reward_terms: Vec<String>, max_episode_s: f32) -> EnvSpec {
-    let control = &robot.control;
+    let robot = ControlledRobot::from(robot);
+    let observation = policy_fields(robot.joints.len());
+    spec_of(task, &robot, observation, reward_terms, max_episode_s)
+}
+
+/// Returns the spec of a task with these observations, and joint position offsets as actions.
+pub(crate) fn spec_of(
+    task: &str,
+    robot: &ControlledRobot,
+    observation: Vec<SpecField>,
+    reward_terms: Vec<String>,
+    max_episode_s: f32,
+) -> EnvSpec {
+    let alike = robot.gains.iter().all(|gains| *gains == robot.gains[0]);
+    let [kp, kd] = robot.gains[0];
     EnvSpec {
         task: task.to_owned(),
         robot: robot.name.clone(),
-        observation: policy_fields(),
+        observation,
         critic_observation: Vec::new(),
         action: vec![field(
             "joint_position_offset",
-            NUM_JOINTS,
+            robot.joints.len(),
             "action_scale",
             1.0,
             "commanded joint position relative to the default pose, in units of action_scale",
         )],
-        joint_order: JOINT_NAMES.map(str::to_owned).to_vec(),
-        policy_dt: control.policy_dt(),
-        actuator_dt: control.actuator_dt(),
-        kp: control.kp[0],
-        kd: control.kd[0],
-        joint_gains: control.joint_gains(),
-        action_scale: control.action_scale,
-        default_pose: control.default_pose.to_vec(),
+        joint_order: robot.joints.clone(),
+        policy_dt: robot.policy_dt(),
+        actuator_dt: robot.actuator_dt,
+        kp,
+        kd,
+        joint_gains: if alike { Vec::new() } else { robot.gains.clone() },
+        action_scale: robot.action_scale,
+        default_pose: robot.default_pose.clone(),
         reward_terms,
-        max_episode_steps: (f64::from(max_episode_s) / control.policy_dt()).round() as u32,
+        max_episode_steps: (f64::from(max_episode_s) / robot.policy_dt()).round() as u32,
     }
 }
 
-/// Returns the entries of U2E, eq. 14, which [`observe`] writes.
-fn policy_fields() -> Vec<SpecField> {
+/// Returns the entries of U2E, eq. 14, which [`observe`] writes, of a robot with this number of joints.
+pub(crate) fn policy_fields(joints: usize) -> Vec<SpecField> {
     vec![
         field("base_angular_velocity", 3, "rad/s", 50.0, "angular velocity of the base in the base frame, omega_t"),
         field("projected_gravity", 3, "", 1.0, "unit vector of gravity in the base frame, g_t"),
@@ -52,23 +67,30 @@ fn policy_fields() -> Vec<SpecField> {
             5.0,
             "commanded velocity in the base frame: forward, left, yaw rate, c_t",
         ),
-        field("joint_position", NUM_JOINTS, "rad", 6.3, "position relative to the default pose, q - q_default"),
-        field("joint_velocity", NUM_JOINTS, "rad/s", 100.0, "velocity, dq"),
-        field("previous_action", NUM_JOINTS, "", 1.0, "action of the previous step, clipped, a_(t-1)"),
+        field("joint_position", joints, "rad", 6.3, "position relative to the default pose, q - q_default"),
+        field("joint_velocity", joints, "rad/s", 100.0, "velocity, dq"),
+        field("previous_action", joints, "", 1.0, "action of the previous step, clipped, a_(t-1)"),
     ]
 }
 
-/// Returns the privileged entries, which [`observe_privileged`] writes.
+/// Returns the privileged entries of a quadruped, which [`observe_privileged`] writes.
 pub fn privileged_fields() -> Vec<SpecField> {
+    privileged_fields_of(&["FL", "FR", "RL", "RR"])
+}
+
+/// Returns the privileged entries of a robot with these feet.
+pub(crate) fn privileged_fields_of(feet: &[&str]) -> Vec<SpecField> {
+    let force = format!("normal force on each foot: {}", feet.join(", "));
     vec![
         field("true_linear_velocity", 3, "m/s", 50.0, "velocity of the base in the base frame"),
         field("true_angular_velocity", 3, "rad/s", 50.0, "angular velocity of the base in the base frame"),
         field("base_height", 1, "m", 5.0, "height of the base above the ground under it"),
-        field("foot_force", 4, "N", 1000.0, "normal force on each foot: FL, FR, RL, RR"),
+        field("foot_force", feet.len(), "N", 1000.0, &force),
     ]
 }
 
-fn field(name: &str, size: usize, unit: &str, bound: f32, text: &str) -> SpecField {
+/// Returns a field whose entries are within ±`bound`.
+pub(crate) fn field(name: &str, size: usize, unit: &str, bound: f32, text: &str) -> SpecField {
     SpecField {
         name: name.to_owned(),
         size,
@@ -79,42 +101,41 @@ fn field(name: &str, size: usize, unit: &str, bound: f32, text: &str) -> SpecFie
     }
 }
 
-/// Writes the observation of U2E, eq. 14, into `obs` (45 values), clipped to the bounds of [`base_spec`].
-pub fn observe(robot: &RobotView, command: [f32; 3], default_pose: &PerJoint, action: &PerJoint, obs: &mut [f32]) {
-    let (measured, index) = (robot.measured, robot.index);
-    let gravity = frames::projected_gravity(measured.orientation[index]);
-    write_clipped(&mut obs[0..3], measured.gyro[index], 50.0);
+/// Writes the observation of U2E, eq. 14, into `obs` (9 values and 3 for each joint), clipped to the bounds of [`base_spec`].
+pub fn observe(robot: &RobotView, command: [f32; 3], default_pose: &[f32], action: &[f32], obs: &mut [f32]) {
+    let joints = robot.q.len();
+    let gravity = frames::projected_gravity(robot.orientation);
+    write_clipped(&mut obs[0..3], robot.gyro, 50.0);
     write_clipped(&mut obs[3..6], gravity.to_array(), 1.0);
     write_clipped(&mut obs[6..9], command, 5.0);
-    let q = &measured.q[index];
-    write_clipped(&mut obs[9..21], std::array::from_fn::<f32, NUM_JOINTS, _>(|j| q[j] - default_pose[j]), 6.3);
-    write_clipped(&mut obs[21..33], measured.dq[index], 100.0);
-    obs[33..45].copy_from_slice(action);
+    let (q, rest) = obs[9..].split_at_mut(joints);
+    let (dq, actions) = rest.split_at_mut(joints);
+    write_clipped(q, robot.q.iter().zip(default_pose).map(|(q, pose)| q - pose), 6.3);
+    write_clipped(dq, robot.dq.iter().copied(), 100.0);
+    actions[..joints].copy_from_slice(action);
 }
 
-/// Writes the privileged observation into `obs` (11 values), clipped to the bounds of [`privileged_fields`].
-pub fn observe_privileged(robot: &RobotView, truth: &GroundTruth, obs: &mut [f32]) {
-    let index = robot.index;
+/// Writes the privileged observation into `obs` (7 values and one for each foot), clipped to the bounds of [`privileged_fields`].
+pub fn observe_privileged(robot: &RobotView, truth: &Truth, obs: &mut [f32]) {
     let velocity = linear_velocity_in_base(robot, truth);
     write_clipped(&mut obs[0..3], velocity.to_array(), 50.0);
-    write_clipped(&mut obs[3..6], truth.base_angular_velocity[index], 50.0);
+    write_clipped(&mut obs[3..6], truth.base_angular_velocity, 50.0);
     write_clipped(&mut obs[6..7], [base_height(robot, truth)], 5.0);
-    write_clipped(&mut obs[7..11], truth.foot_force[index], 1000.0);
+    write_clipped(&mut obs[7..], truth.foot_force.iter().copied(), 1000.0);
 }
 
 /// Returns the velocity of the base in the base frame [m/s].
-pub fn linear_velocity_in_base(robot: &RobotView, truth: &GroundTruth) -> Vec3 {
-    let base_from_world = frames::world_from_base(robot.measured.orientation[robot.index]).inverse();
-    base_from_world * Vec3::from(truth.base_linear_velocity[robot.index])
+pub fn linear_velocity_in_base(robot: &RobotView, truth: &Truth) -> Vec3 {
+    frames::world_from_base(robot.orientation).inverse() * Vec3::from(truth.base_linear_velocity)
 }
 
 /// Returns the height of the base above the ground under it [m].
-pub fn base_height(robot: &RobotView, truth: &GroundTruth) -> f32 {
-    let [x, y, z] = truth.base_position[robot.index];
+pub fn base_height(robot: &RobotView, truth: &Truth) -> f32 {
+    let [x, y, z] = truth.base_position;
     z - robot.ground.height(x, y)
 }
 
-fn write_clipped<const N: usize>(entries: &mut [f32], values: [f32; N], bound: f32) {
+fn write_clipped(entries: &mut [f32], values: impl IntoIterator<Item = f32>, bound: f32) {
     for (entry, value) in entries.iter_mut().zip(values) {
         *entry = value.clamp(-bound, bound);
     }
@@ -122,7 +143,7 @@ fn write_clipped<const N: usize>(entries: &mut [f32], values: [f32; N], bound: f
 
 #[cfg(test)]
 mod tests {
-    use twinstep_model::{Ground, RobotStates, go2};
+    use twinstep_model::{Ground, NUM_JOINTS, PerJoint, RobotStates, go2};
 
     use super::*;
 
@@ -146,7 +167,7 @@ mod tests {
         let action: PerJoint = std::array::from_fn(|j| 0.05 * j as f32);
         let mut obs = [f32::NAN; OBS_LEN];
         let ground = Ground::FLAT;
-        let view = RobotView { measured: &states.measured, truth: None, ground: &ground, index: 0 };
+        let view = RobotView::of(&states.measured, Some(&states.truth), &ground, 0);
         observe(&view, [0.4, 0.5, 0.6], &robot.control.default_pose_f32(), &action, &mut obs);
         assert_eq!(obs[..9], [1.0, 2.0, 3.0, 0.0, 0.0, -1.0, 0.4, 0.5, 0.6]);
         for j in 0..NUM_JOINTS {
@@ -167,9 +188,9 @@ mod tests {
         states.truth.base_angular_velocity[0] = [0.1; 3];
         states.truth.foot_force[0] = [10.0, 20.0, 30.0, 40.0];
         let ground = Ground { point: [0.0, 0.0, 0.5], ..Ground::FLAT };
-        let view = RobotView { measured: &states.measured, truth: None, ground: &ground, index: 0 };
+        let view = RobotView::of(&states.measured, Some(&states.truth), &ground, 0);
         let mut obs = [f32::NAN; CRITIC_OBS_LEN];
-        observe_privileged(&view, &states.truth, &mut obs);
+        observe_privileged(&view, &view.truth.expect("a simulator"), &mut obs);
         let expected = [0.7, 0.0, 0.1, 0.1, 0.1, 0.1, 0.4, 10.0, 20.0, 30.0, 40.0];
         assert!(obs.iter().zip(expected).all(|(one, other)| (one - other).abs() < 1e-6), "{obs:?}");
     }

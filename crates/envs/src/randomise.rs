@@ -1,9 +1,10 @@
 //! Domain randomisation: each episode has its own robot. The differences are effects of the catalogue.
 
+use glam::DVec3;
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
-use twinstep_effects::{Effect, EffectSite};
-use twinstep_model::{NUM_JOINTS, RobotModel, Stream};
+use twinstep_effects::{Apply, Effect, EffectSite};
+use twinstep_model::{JointModel, NUM_JOINTS, RobotModel, Stream, TreeModel};
 
 use crate::ObservationNoise;
 use crate::config::{ConfigError, Range, check_range};
@@ -75,17 +76,17 @@ impl Randomisation {
         self.push_m_s[1] > 0.0
     }
 
-    /// Checks that the trunk of `robot` keeps a positive mass.
-    pub fn check_robot(&self, robot: &RobotModel) -> Result<(), ConfigError> {
+    /// Checks that the base of a robot, with this mass [kg], keeps a positive mass.
+    pub fn check_base(&self, mass: f64) -> Result<(), ConfigError> {
         let [scale, payload] = [self.mass_scale[0], self.payload_kg[0]];
-        let lowest = -(robot.trunk.mass as f32) * scale;
+        let lowest = -(mass as f32) * scale;
         if payload > lowest {
             return Ok(());
         }
         Err(ConfigError {
             field: "randomise.payload_kg".to_owned(),
             value: format!("{:?}", self.payload_kg),
-            allowed: format!("above {lowest:.2} kg, because the trunk with the lowest `mass_scale` weighs that much"),
+            allowed: format!("above {lowest:.2} kg, because the base with the lowest `mass_scale` weighs that much"),
         })
     }
 
@@ -105,17 +106,7 @@ impl Randomisation {
     ///
     /// The number of random numbers does not depend on the ranges, so that poses and commands do not either.
     pub fn sample(&self, robot: &RobotModel, random: &mut Stream) -> Option<RobotModel> {
-        let mut draw = |range: Range| f64::from(sample(range, random));
-        let mass_scale = draw(self.mass_scale);
-        let payload = draw(self.payload_kg);
-        let shift: [f64; 3] = std::array::from_fn(|_| draw(self.com_shift_m));
-        let friction_scale = draw(self.friction_scale);
-        let gains = [draw(self.kp_scale), draw(self.kd_scale)];
-        let delay_s = 1e-3 * draw(self.command_delay_ms);
-        let Self { push_m_s, push_interval_s, noise, effects, .. } = *self;
-        if (Self { push_m_s, push_interval_s, noise, effects, ..Self::default() }) == *self {
-            return None;
-        }
+        let Draw { mass_scale, payload, shift, friction_scale, gains, delay_s } = self.draw(random)?;
         let mut sampled = robot.clone();
         let bodies = sampled.legs.iter_mut().flat_map(|leg| &mut leg.bodies).chain([&mut sampled.trunk]);
         bodies.for_each(|body| *body = body.scaled(mass_scale));
@@ -129,6 +120,50 @@ impl Randomisation {
         }
         Some(sampled)
     }
+
+    /// Samples the robot of an episode like [`Randomisation::sample`], for a robot of any tree. Payload and shift are those of its base.
+    pub fn sample_tree(&self, robot: &TreeModel, random: &mut Stream) -> Option<TreeModel> {
+        let Draw { mass_scale, payload, shift, friction_scale, gains, delay_s } = self.draw(random)?;
+        let mut sampled = robot.clone();
+        for body in &mut sampled.tree.bodies {
+            body.inertia = body.inertia.scaled(mass_scale);
+        }
+        let base = &mut sampled.tree.bodies[0].inertia;
+        *base = base.with_point_mass(payload, base.com);
+        base.com += DVec3::from(shift);
+        sampled.contact.friction *= friction_scale;
+        for joint in &mut sampled.joints {
+            apply_to_joint(joint, "pd_gain", &gains);
+            apply_to_joint(joint, "command_delay", &[delay_s]);
+        }
+        Some(sampled)
+    }
+
+    /// Draws what differs in an episode. Returns `None` if no range differs from no effect.
+    fn draw(&self, random: &mut Stream) -> Option<Draw> {
+        let mut draw = |range: Range| f64::from(sample(range, random));
+        let drawn = Draw {
+            mass_scale: draw(self.mass_scale),
+            payload: draw(self.payload_kg),
+            shift: std::array::from_fn(|_| draw(self.com_shift_m)),
+            friction_scale: draw(self.friction_scale),
+            gains: [draw(self.kp_scale), draw(self.kd_scale)],
+            delay_s: 1e-3 * draw(self.command_delay_ms),
+        };
+        let Self { push_m_s, push_interval_s, noise, effects, .. } = *self;
+        let is_nominal = Self { push_m_s, push_interval_s, noise, effects, ..Self::default() } == *self;
+        (!is_nominal).then_some(drawn)
+    }
+}
+
+/// What differs in an episode.
+struct Draw {
+    mass_scale: f64,
+    payload: f64,
+    shift: [f64; 3],
+    friction_scale: f64,
+    gains: [f64; 2],
+    delay_s: f64,
 }
 
 /// Returns a value from a range, with uniform probability.
@@ -139,6 +174,12 @@ fn sample([low, high]: Range, random: &mut Stream) -> f32 {
 fn apply(robot: &mut RobotModel, name: &str, site: EffectSite, values: &[f64]) {
     let effect = Effect::named(name).expect("an effect of the catalogue");
     effect.apply(robot, site, values).expect("`check_robot` has checked the ranges");
+}
+
+fn apply_to_joint(joint: &mut JointModel, name: &str, values: &[f64]) {
+    let effect = Effect::named(name).expect("an effect of the catalogue");
+    let Apply::Joint(change) = effect.apply else { unreachable!("an effect of joints") };
+    change(joint, values).expect("`check` has checked the ranges");
 }
 
 #[cfg(test)]
@@ -160,13 +201,13 @@ mod tests {
     #[test]
     fn payload_that_outweighs_the_trunk_is_rejected() {
         let config = Randomisation { mass_scale: [0.4, 1.0], payload_kg: [-3.0, 0.0], ..Randomisation::default() };
-        expect!["`randomise.payload_kg` = [-3.0, 0.0] is not allowed: above -2.77 kg, because the trunk with the lowest `mass_scale` weighs that much"].assert_eq(&config.check_robot(&go2()).expect_err("too light").to_string());
+        expect!["`randomise.payload_kg` = [-3.0, 0.0] is not allowed: above -2.77 kg, because the base with the lowest `mass_scale` weighs that much"].assert_eq(&config.check_base(go2().trunk.mass).expect_err("too light").to_string());
     }
 
     #[test]
     fn defaults_are_valid_and_return_no_robot() {
         let config = Randomisation::default();
-        assert_eq!((config.check(), config.check_robot(&go2())), (Ok(()), Ok(())));
+        assert_eq!((config.check(), config.check_base(go2().trunk.mass)), (Ok(()), Ok(())));
         assert_eq!(config.sample(&go2(), &mut stream(0, "test", 0)), None);
     }
 

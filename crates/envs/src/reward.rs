@@ -1,6 +1,6 @@
 //! Reward terms, one function each. Weights and signs are in the file of a task.
 
-use twinstep_model::{NUM_JOINTS, PerJoint, PerLeg};
+use crate::feet::FootState;
 
 /// Terms that depend on the ground truth of a simulator. A task on a real robot has no such term.
 pub const NEED_GROUND_TRUTH: [&str; 8] = [
@@ -70,33 +70,35 @@ pub struct RewardInput<'a> {
     /// Unit vector of gravity in the base frame.
     pub gravity: [f32; 3],
     /// Joint position [rad].
-    pub q: &'a PerJoint,
+    pub q: &'a [f32],
     /// Joint velocity [rad/s].
-    pub dq: &'a PerJoint,
+    pub dq: &'a [f32],
     /// Joint velocity of the previous policy step [rad/s].
-    pub previous_dq: &'a PerJoint,
+    pub previous_dq: &'a [f32],
     /// Joint torque [N·m].
-    pub tau: &'a PerJoint,
+    pub tau: &'a [f32],
+    /// Weight times standing height relative to that of the Go2, by which torques are divided.
+    pub torque_scale: f32,
     /// Action of this step, clipped.
-    pub action: &'a PerJoint,
+    pub action: &'a [f32],
     /// Action of the previous step, clipped.
-    pub previous_action: &'a PerJoint,
+    pub previous_action: &'a [f32],
     /// The default pose [rad].
-    pub default_pose: &'a PerJoint,
+    pub default_pose: &'a [f32],
     /// Lower soft limit of the joint positions [rad].
-    pub soft_lower: &'a PerJoint,
+    pub soft_lower: &'a [f32],
     /// Upper soft limit of the joint positions [rad].
-    pub soft_upper: &'a PerJoint,
+    pub soft_upper: &'a [f32],
+    /// Indices of the hips.
+    pub hips: &'a [usize],
     /// Air time of each foot that touched down in this step, 0 for the others [s].
-    pub touchdown_air_time: PerLeg,
+    pub touchdown_air_time: &'a [f32],
     /// Duration of a swing phase above which [`feet_air_time`] is positive [s].
     pub target_air_time: f32,
     /// True for each foot on the ground.
-    pub foot_contact: [bool; 4],
-    /// Height of each foot's centre above the ground under it [m].
-    pub foot_height: PerLeg,
-    /// Horizontal speed of each foot [m/s].
-    pub foot_speed: PerLeg,
+    pub foot_contact: &'a [bool],
+    /// Motion of each foot; none without ground truth.
+    pub feet: &'a [FootState],
     /// Height of swinging feet without a penalty [m].
     pub target_foot_height: f32,
     /// Height of the base above the ground under it [m].
@@ -147,10 +149,10 @@ pub fn flat_orientation(input: &RewardInput<'_>) -> f32 {
     input.gravity[0].powi(2) + input.gravity[1].powi(2)
 }
 
-/// Returns Σ τ² over the joints [N²·m²].
+/// Returns Σ τ² over the joints, of torques that are divided by the weight times the standing height relative to the Go2 [N²·m²].
 #[inline]
 pub fn joint_torque(input: &RewardInput<'_>) -> f32 {
-    input.tau.iter().map(|tau| tau * tau).sum()
+    input.tau.iter().map(|tau| tau * tau).sum::<f32>() / (input.torque_scale * input.torque_scale)
 }
 
 /// Returns Σ (Δdq / dt)² over the joints [rad²/s⁴].
@@ -169,7 +171,7 @@ pub fn action_rate(input: &RewardInput<'_>) -> f32 {
 #[inline]
 pub fn joint_position_limits(input: &RewardInput<'_>) -> f32 {
     let outside = |j: usize| (input.soft_lower[j] - input.q[j]).max(0.0) + (input.q[j] - input.soft_upper[j]).max(0.0);
-    (0..NUM_JOINTS).map(outside).sum()
+    (0..input.q.len()).map(outside).sum()
 }
 
 /// Returns Σ (air time − target) over the feet that touched down, or 0 if the velocity command is below 0.1 [s].
@@ -189,14 +191,14 @@ pub fn feet_clearance(input: &RewardInput<'_>) -> f32 {
     if !has_motion_command(input) {
         return 0.0;
     }
-    let feet = input.foot_height.iter().zip(&input.foot_speed);
-    feet.map(|(height, speed)| (height - input.target_foot_height).abs() * speed.sqrt()).sum()
+    let clearance = |foot: &FootState| (foot.height - input.target_foot_height).abs() * foot.horizontal_speed.sqrt();
+    input.feet.iter().map(clearance).sum()
 }
 
 /// Returns Σ of the squared horizontal speeds of the feet on the ground [m²/s²].
 #[inline]
 pub fn feet_slip(input: &RewardInput<'_>) -> f32 {
-    let feet = input.foot_speed.iter().zip(&input.foot_contact);
+    let feet = input.feet.iter().map(|foot| foot.horizontal_speed).zip(input.foot_contact);
     feet.map(|(speed, contact)| if *contact { speed * speed } else { 0.0 }).sum()
 }
 
@@ -209,7 +211,7 @@ pub fn base_height(input: &RewardInput<'_>) -> f32 {
 /// Returns Σ (q − q_default)² over the hips [rad²].
 #[inline]
 pub fn hip_deviation(input: &RewardInput<'_>) -> f32 {
-    (0..NUM_JOINTS).step_by(3).map(|hip| (input.q[hip] - input.default_pose[hip]).powi(2)).sum()
+    input.hips.iter().map(|hip| (input.q[*hip] - input.default_pose[*hip]).powi(2)).sum()
 }
 
 /// Returns `1 / policy_dt` if the episode ends in this step other than by the time limit, else 0 [1/s].
@@ -245,7 +247,8 @@ pub fn epistemic_uncertainty(input: &RewardInput<'_>) -> f32 {
 mod tests {
     use super::*;
 
-    const ZERO: PerJoint = [0.0; NUM_JOINTS];
+    const ZERO: [f32; 12] = [0.0; 12];
+    const STANDS: FootState = FootState { height: 0.022, horizontal_speed: 0.0, vertical_velocity: 0.0 };
 
     fn at_rest() -> RewardInput<'static> {
         RewardInput {
@@ -259,16 +262,17 @@ mod tests {
             dq: &ZERO,
             previous_dq: &ZERO,
             tau: &ZERO,
+            torque_scale: 1.0,
             action: &ZERO,
             previous_action: &ZERO,
             default_pose: &ZERO,
-            soft_lower: &[-1.0; NUM_JOINTS],
-            soft_upper: &[1.0; NUM_JOINTS],
-            touchdown_air_time: [0.0; 4],
+            soft_lower: &[-1.0; 12],
+            soft_upper: &[1.0; 12],
+            hips: &[0, 3, 6, 9],
+            touchdown_air_time: &[0.0; 4],
             target_air_time: 0.1,
-            foot_contact: [true; 4],
-            foot_height: [0.022; 4],
-            foot_speed: [0.0; 4],
+            foot_contact: &[true; 4],
+            feet: &[STANDS; 4],
             target_foot_height: 0.08,
             base_height: 0.3,
             target_base_height: 0.3,
@@ -294,18 +298,20 @@ mod tests {
 
     #[test]
     fn long_swing_phase_is_rewarded_only_with_a_velocity_command() {
-        let landed = RewardInput { touchdown_air_time: [0.3, 0.0, 0.0, 0.0], ..at_rest() };
+        let landed = RewardInput { touchdown_air_time: &[0.3, 0.0, 0.0, 0.0], ..at_rest() };
         assert_eq!(feet_air_time(&landed), 0.0);
         assert!((feet_air_time(&RewardInput { command: [1.0, 0.0, 0.0], ..landed }) - 0.2).abs() < 1e-6);
     }
 
     #[test]
     fn only_feet_on_the_ground_slip_and_only_moving_feet_need_clearance() {
-        let moving = RewardInput { command: [1.0, 0.0, 0.0], foot_speed: [0.5, 0.0, 0.0, 2.0], ..at_rest() };
-        assert_eq!(feet_slip(&RewardInput { foot_contact: [true, true, true, false], ..moving }), 0.25);
+        let feet = [0.5, 0.0, 0.0, 2.0].map(|horizontal_speed| FootState { horizontal_speed, ..STANDS });
+        let moving = RewardInput { command: [1.0, 0.0, 0.0], feet: &feet, ..at_rest() };
+        assert_eq!(feet_slip(&RewardInput { foot_contact: &[true, true, true, false], ..moving }), 0.25);
         let expected = 0.058 * (0.5f32.sqrt() + 2f32.sqrt());
         assert!((feet_clearance(&moving) - expected).abs() < 1e-6);
-        assert_eq!(feet_clearance(&RewardInput { foot_height: [0.08; 4], ..moving }), 0.0);
+        let high = feet.map(|foot| FootState { height: 0.08, ..foot });
+        assert_eq!(feet_clearance(&RewardInput { feet: &high, ..moving }), 0.0);
         assert_eq!(feet_clearance(&RewardInput { command: [0.0; 3], ..moving }), 0.0);
     }
 

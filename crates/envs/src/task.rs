@@ -1,6 +1,6 @@
 //! Interface of a task: observations, reward terms and the end of an episode.
 
-use twinstep_model::{EnvSpec, GaitCommand, Ground, GroundTruth, Measured, PerJoint, Stream, VelocityCommand};
+use twinstep_model::{EnvSpec, GaitCommand, Ground, GroundTruth, Measured, Stream, VelocityCommand};
 
 /// A task on one robot. [`crate::TaskEnv`] runs it on many.
 ///
@@ -14,13 +14,13 @@ pub trait Task: Send {
     fn spec(&self) -> &EnvSpec;
 
     /// Starts an episode. Returns the initial joint positions [rad] and the state.
-    fn start(&self, random: &mut Stream) -> (PerJoint, Self::State);
+    fn start(&self, random: &mut Stream) -> (Vec<f32>, Self::State);
 
     /// Writes the observation of group `policy`. `action` is the last action, clipped to [−1, 1]; 0 after a reset.
-    fn observe(&self, state: &Self::State, robot: &RobotView, action: &PerJoint, obs: &mut [f32]);
+    fn observe(&self, state: &Self::State, robot: &RobotView, action: &[f32], obs: &mut [f32]);
 
     /// Writes the observation of group `critic`. Called only if the spec has one.
-    fn observe_critic(&self, state: &Self::State, robot: &RobotView, obs: &mut [f32]);
+    fn observe_critic(&self, _state: &Self::State, _robot: &RobotView, _obs: &mut [f32]) {}
 
     /// Writes the weighted reward terms of a policy step into `terms`, and advances the state.
     ///
@@ -43,14 +43,59 @@ pub trait Task: Send {
 /// One robot after a reset or a step.
 #[derive(Clone, Copy, Debug)]
 pub struct RobotView<'a> {
-    /// Sensor readings of all robots.
-    pub measured: &'a Measured,
-    /// What only a simulator knows of all robots; `None` on a real robot.
-    pub truth: Option<&'a GroundTruth>,
-    /// The ground under the robots.
+    /// Joint positions [rad or m].
+    pub q: &'a [f32],
+    /// Joint velocities [rad/s or m/s].
+    pub dq: &'a [f32],
+    /// Torques estimated from the motor currents, means over the last actuator period [N·m or N].
+    pub tau: &'a [f32],
+    /// Rotation world-from-base, `[w, x, y, z]`.
+    pub orientation: [f32; 4],
+    /// Angular velocity of the base, read by the gyroscope in the base frame [rad/s].
+    pub gyro: [f32; 3],
+    /// What only a simulator knows; `None` on a real robot.
+    pub truth: Option<Truth<'a>>,
+    /// The ground under the robot.
     pub ground: &'a Ground,
-    /// Index of the robot.
-    pub index: usize,
+}
+
+/// What only a simulator knows of one robot.
+#[derive(Clone, Copy, Debug)]
+pub struct Truth<'a> {
+    /// Position of the base frame's origin in the world frame [m].
+    pub base_position: [f32; 3],
+    /// Velocity of the base frame's origin, in the world frame [m/s].
+    pub base_linear_velocity: [f32; 3],
+    /// Angular velocity of the base, in the base frame, without the bias of the gyroscope [rad/s].
+    pub base_angular_velocity: [f32; 3],
+    /// Normal force on each foot [N].
+    pub foot_force: &'a [f32],
+    /// True if a link other than those that may touches the ground.
+    pub body_contact: bool,
+    /// Epistemic uncertainty of the actuators, mean over the joints [nat]; 0 if they do not estimate it.
+    pub epistemic_uncertainty: f32,
+}
+
+impl<'a> RobotView<'a> {
+    /// Returns robot `index` of a batch.
+    pub fn of(measured: &'a Measured, truth: Option<&'a GroundTruth>, ground: &'a Ground, index: usize) -> Self {
+        Self {
+            q: &measured.q[index],
+            dq: &measured.dq[index],
+            tau: &measured.tau[index],
+            orientation: measured.orientation[index],
+            gyro: measured.gyro[index],
+            truth: truth.map(|truth| Truth {
+                base_position: truth.base_position[index],
+                base_linear_velocity: truth.base_linear_velocity[index],
+                base_angular_velocity: truth.base_angular_velocity[index],
+                foot_force: &truth.foot_force[index],
+                body_contact: truth.body_contact[index],
+                epistemic_uncertainty: truth.epistemic_uncertainty[index],
+            }),
+            ground,
+        }
+    }
 }
 
 /// One robot after a policy step, with what it was before.
@@ -59,11 +104,11 @@ pub struct Step<'a> {
     /// The robot after the step.
     pub robot: RobotView<'a>,
     /// Action of the step, clipped to [−1, 1].
-    pub action: &'a PerJoint,
+    pub action: &'a [f32],
     /// Action of the previous step, clipped to [−1, 1].
-    pub previous_action: &'a PerJoint,
+    pub previous_action: &'a [f32],
     /// Joint velocity before the step [rad/s].
-    pub previous_dq: &'a PerJoint,
+    pub previous_dq: &'a [f32],
     /// Number of policy steps of the episode, including this one.
     pub length: u32,
 }

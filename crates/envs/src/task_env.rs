@@ -3,9 +3,9 @@
 use glam::Vec3;
 use twinstep_effects::RobotSampler;
 use twinstep_model::{
-    AgentCommands, AutoresetMode, Backend, BackendError, Command, EndedEpisode, EnvError, EnvSpec, GaitCommand, Ground,
-    InitialState, Pose, RealTimeReport, ResetCause, ResetRequest, RobotSample, Scene, StepBatch, Stream, VecEnv,
-    VelocityCommand, frames, stream,
+    AgentCommands, AutoresetMode, Backend, BackendError, Command, ControlConfig, EndedEpisode, EnvError, EnvSpec,
+    GaitCommand, Ground, InitialState, PerJoint, Pose, RealTimeReport, ResetCause, ResetRequest, RobotSample, Scene,
+    StepBatch, Stream, VecEnv, VelocityCommand, frames, stream,
 };
 
 use crate::episode::{Episode, StepOutcome};
@@ -61,7 +61,7 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
         let TaskEnvConfig { randomise, robot_sampler: robots, autoreset, max_episode_steps, seed } = settings;
         let robot = backend.robot();
         randomise.check()?;
-        randomise.check_robot(robot)?;
+        randomise.check_base(robot.trunk.mass)?;
         let mut spec = task.spec().clone();
         spec.max_episode_steps = max_episode_steps.unwrap_or(spec.max_episode_steps);
         let (num_envs, control) = (backend.num_robots(), &robot.control);
@@ -115,12 +115,17 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
         }
         for env in envs {
             let Self { task, backend, randomise, robots, .. } = self;
-            let start = self.episodes[*env].start(task, backend.robot(), randomise, robots.as_ref());
+            let nominal = backend.robot();
+            let start = self.episodes[*env].start(task, randomise, |effects, random| {
+                let sampled = robots.as_ref().map(|sampler| sampler.sample(effects));
+                randomise.sample(sampled.as_ref().unwrap_or(nominal), random).or(sampled)
+            });
+            let q = per_joint(&start.q);
             set_commands(task, &self.agent_commands, *env, &mut self.episodes[*env].state);
-            self.commands[*env].q = start.q;
+            self.commands[*env].q = q;
             let initial_state = InitialState {
                 actuator_seed: start.actuator_seed,
-                ..InitialState::standing_on(&self.ground, backend.robot(), start.q, START_CLEARANCE)
+                ..InitialState::standing_on(&self.ground, backend.robot(), q, START_CLEARANCE)
             };
             match start.robot {
                 Some(robot) => backend.reset_with_model(*env, &robot, &initial_state)?,
@@ -188,7 +193,7 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
             task.set_velocity_command(&mut episode.state, command);
         }
         if let Some(report) = backend.real_time() {
-            episode.action = report.applied;
+            episode.action.copy_from_slice(&report.applied);
         }
     }
 
@@ -221,7 +226,9 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
         for (env, (episode, action)) in self.episodes.iter_mut().zip(actions).enumerate() {
             self.active[env] = episode.running;
             if episode.running {
-                self.commands[env].q = episode.joint_targets(control, action, &dq[env]);
+                let action: &PerJoint = action;
+                episode.act(action, &dq[env]);
+                self.commands[env].q = joint_targets(control, &episode.action);
             } else {
                 waiting.push(env);
             }
@@ -303,13 +310,24 @@ fn set_commands<T: Task>(task: &T, commands: &AgentCommands, env: usize, state: 
     }
 }
 
+/// Returns values of a quadruped's joints as an array.
+fn per_joint(values: &[f32]) -> PerJoint {
+    std::array::from_fn(|joint| values[joint])
+}
+
+/// Returns the commanded joint positions of an action [rad].
+fn joint_targets(control: &ControlConfig, action: &[f32]) -> PerJoint {
+    let scale = control.action_scale as f32;
+    std::array::from_fn(|joint| control.default_pose[joint] as f32 + scale * action[joint])
+}
+
 /// Returns entries of environment `env` in an array with `len` entries per environment.
 fn row(array: &mut [f32], env: usize, len: usize) -> &mut [f32] {
     &mut array[env * len..(env + 1) * len]
 }
 
 fn view<'a>(backend: &'a impl Backend, ground: &'a Ground, index: usize) -> RobotView<'a> {
-    RobotView { measured: backend.measured(), truth: backend.ground_truth(), ground, index }
+    RobotView::of(backend.measured(), backend.ground_truth(), ground, index)
 }
 
 impl<B: Backend, T: Task> VecEnv for TaskEnv<B, T> {
@@ -401,26 +419,27 @@ impl<B: Backend, T: Task> VecEnv for TaskEnv<B, T> {
             return Err(EnvError::NeedsReset { env });
         }
         let robot = view(&self.backend, &self.ground, env);
+        let q = per_joint(robot.q);
         // Where the position is not measured, the robot stands at the origin.
         let position = robot.truth.map_or_else(
-            || InitialState::standing_on(robot.ground, self.backend.robot(), robot.measured.q[env], 0.0).base_position,
-            |truth| truth.base_position[env],
+            || InitialState::standing_on(robot.ground, self.backend.robot(), q, 0.0).base_position,
+            |truth| truth.base_position,
         );
-        let rotation = frames::world_from_base(robot.measured.orientation[env]);
+        let rotation = frames::world_from_base(robot.orientation);
         let world_from_base = Pose { position: Vec3::from(position), rotation };
-        let scene = Scene::new(self.backend.robot(), world_from_base, &robot.measured.q[env], robot.ground);
+        let scene = Scene::new(self.backend.robot(), world_from_base, &q, robot.ground);
         let velocity = robot.truth.map(|truth| {
-            let linear = rotation.inverse() * Vec3::from(truth.base_linear_velocity[env]);
-            [linear.x, linear.y, robot.measured.gyro[env][2]]
+            let linear = rotation.inverse() * Vec3::from(truth.base_linear_velocity);
+            [linear.x, linear.y, robot.gyro[2]]
         });
         Ok(Scene {
             command: self.task.velocity_command(&episode.state),
             velocity,
-            torque: Some(robot.measured.tau[env].to_vec()),
-            contact_force: robot.truth.map(|truth| truth.foot_force[env].to_vec()),
+            torque: Some(robot.tau.to_vec()),
+            contact_force: robot.truth.map(|truth| truth.foot_force.to_vec()),
             reward_terms: episode.terms.clone(),
             // Zero is that of actuators that do not estimate it.
-            uncertainty: robot.truth.map(|truth| truth.epistemic_uncertainty[env]).filter(|value| *value != 0.0),
+            uncertainty: robot.truth.map(|truth| truth.epistemic_uncertainty).filter(|value| *value != 0.0),
             ..scene
         })
     }

@@ -11,7 +11,7 @@
 
 use glam::{DMat2, DVec2, DVec3};
 use twinstep_logs::Log;
-use twinstep_model::{FootKinematics, Joint, Leg, NUM_JOINTS, NUM_LEGS, RobotModel};
+use twinstep_model::{Feet, Joint, Leg, NUM_JOINTS, NUM_LEGS, RobotModel};
 
 use crate::orientation::orientation;
 
@@ -105,7 +105,7 @@ impl BaseEstimate {
 
 /// Reads what the sensors of each row say.
 fn measurements(log: &Log, robot: &RobotModel) -> Vec<RowMeasurement> {
-    let kinematics = FootKinematics::new(robot);
+    let kinematics = Feet::from(robot);
     let radius = robot.shapes.foot_radius;
     let vector = |kind: &str| ["x", "y", "z"].map(|axis| log.channel(&format!("{kind}_{axis}")));
     let (gyro, acc) = (vector("gyro"), vector("acc"));
@@ -128,7 +128,7 @@ fn measurements(log: &Log, robot: &RobotModel) -> Vec<RowMeasurement> {
         let omega = DVec3::from_array(gyro.map(|cells| cells.map_or(0.0, |cells| finite(cells[row]))));
         let acceleration = (acc.iter().all(|cells| cells.is_some_and(|cells| cells[row].is_finite())))
             .then(|| rotation * DVec3::from_array(acc.map(|cells| cells.map_or(0.0, |cells| cells[row]))) + GRAVITY);
-        let feet = kinematics.feet(&q, &dq);
+        let feet = kinematics.motions(&q, &dq).collect::<Vec<_>>();
         let feet = std::array::from_fn(|leg| {
             let position = feet[leg].position.as_dvec3();
             let hip = 3 * leg;

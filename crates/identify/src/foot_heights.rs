@@ -6,7 +6,7 @@
 use std::ops::Range;
 
 use twinstep_logs::Log;
-use twinstep_model::{BaseMount, FootKinematics, JOINT_NAMES, Joint, NUM_JOINTS, NUM_LEGS, PerJoint, RobotModel};
+use twinstep_model::{BaseMount, Feet, JOINT_NAMES, Joint, NUM_JOINTS, NUM_LEGS, PerJoint, RobotModel};
 
 use crate::orientation::orientation;
 
@@ -63,7 +63,7 @@ impl FootHeights {
         let q = columns(|log, joint| log.q(joint).map(<[f64]>::to_vec));
         let dq = columns(|log, joint| log.dq(joint).map(<[f64]>::to_vec));
         let (Some(q), Some(dq), Some(_)) = (q, dq, log.channel("quat_w")) else { return Self { blocks: Vec::new() } };
-        let feet = FootKinematics::new(robot);
+        let feet = Feet::from(robot);
         let length = ((BLOCK_S * log.meta().rate_hz).round() as usize).max(1);
         let floating = log.segments().filter(|(segment, _)| segment.base == BaseMount::Floating);
         let blocks = floating.flat_map(|(_, rows)| {
@@ -145,13 +145,13 @@ impl FootHeights {
 }
 
 /// Returns the height of each foot relative to the base's origin, in world axes [m].
-fn heights(log: &Log, row: usize, feet: &FootKinematics, q: &PerJoint) -> [f64; NUM_LEGS] {
+fn heights(log: &Log, row: usize, feet: &Feet, q: &PerJoint) -> Vec<f64> {
     let rotation = orientation(log, row);
-    feet.feet(q, &[0.0; NUM_JOINTS]).map(|foot| (rotation * foot.position.as_dvec3()).z)
+    feet.motions(q, &[0.0; NUM_JOINTS]).map(|foot| (rotation * foot.position.as_dvec3()).z).collect()
 }
 
 /// Returns the derivative of the height of a joint's foot with respect to its position [m/rad].
-fn lever(log: &Log, row: usize, feet: &FootKinematics, q: &PerJoint, joint: usize) -> f64 {
+fn lever(log: &Log, row: usize, feet: &Feet, q: &PerJoint, joint: usize) -> f64 {
     let leg = joint / (NUM_JOINTS / NUM_LEGS);
     let [low, high] = [-STEP, STEP].map(|step| {
         let mut moved = *q;

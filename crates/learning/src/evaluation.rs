@@ -3,7 +3,7 @@
 //! A policy is judged by the measured velocity and by falls, never by its reward: policies that stand still collect
 //! reward as well.
 
-use twinstep_model::{EnvError, ResetRequest, RobotModel, VecEnv};
+use twinstep_model::{EnvError, Feet, ResetRequest, VecEnv};
 use twinstep_policy::{Policy, PolicyRunner};
 
 use crate::walking::{Evaluation, Robots, Sums, Walker};
@@ -36,8 +36,10 @@ pub enum EvaluationError {
 /// Robots of an evaluation.
 #[derive(Clone, Copy, Debug)]
 pub struct EvaluationPlan<'a> {
-    /// Model of the robots, for the lengths of their legs.
-    pub robot: &'a RobotModel,
+    /// Feet of the robots.
+    pub feet: &'a Feet,
+    /// Torque limit of each joint [N·m].
+    pub torque_limits: &'a [f64],
     /// Simulated time of each robot [s].
     pub seconds: f64,
     /// Seed of robots and commands.
@@ -54,17 +56,17 @@ pub fn evaluate(
     plan: EvaluationPlan,
     mut proceed: impl FnMut(f64) -> bool,
 ) -> Result<Evaluation, EvaluationError> {
-    let EvaluationPlan { robot, seconds, seed } = plan;
+    let EvaluationPlan { feet, torque_limits, seconds, seed } = plan;
     let spec = env.spec().clone();
     if spec.hash() != policy.spec.hash() {
         return Err(EvaluationError::OtherSpec { policy: policy.spec.hash(), env: spec.hash() });
     }
-    let robots = Robots::new(&spec, robot).map_err(EvaluationError::Missing)?;
+    let robots = Robots::new(&spec, feet, torque_limits).map_err(EvaluationError::Missing)?;
     let num_envs = env.num_envs();
     let mut runner = PolicyRunner::new(policy);
     let mut obs = env.reset(&ResetRequest::seeded(seed, num_envs))?.to_vec();
     let mut actions = vec![0.0; num_envs * spec.action_len()];
-    let mut walkers = vec![Walker::default(); num_envs];
+    let mut walkers = vec![Walker::new(feet.len()); num_envs];
     let mut sums = Sums::default();
     let steps = (seconds / spec.policy_dt).round() as usize;
     for step in 0..steps {
@@ -84,5 +86,5 @@ pub fn evaluate(
         }
     }
     let up = walkers.iter().filter(|walker| !walker.has_fallen).count();
-    Ok(sums.evaluation(num_envs, up, seconds, spec.policy_dt))
+    Ok(sums.evaluation(num_envs, up, seconds, &robots))
 }

@@ -1,6 +1,6 @@
 //! Mirroring of observations and actions at the robot's sagittal plane: left and right are exchanged.
 
-use twinstep_model::{EnvSpec, Joint, JointKind, Leg, NUM_JOINTS, SpecField};
+use twinstep_model::{EnvSpec, JOINT_NAMES, Joint, JointKind, Leg, SpecField};
 
 /// Mirrored vector: entry `i` is `signs[i] · vector[indices[i]]`.
 #[derive(Clone, Debug, PartialEq)]
@@ -20,19 +20,20 @@ pub struct NoMirror {
 impl Mirror {
     /// Returns the mirror of the observation of a policy, followed by the privileged one of a critic.
     pub fn of_observations(spec: &EnvSpec) -> Result<Self, NoMirror> {
-        Self::of_fields(spec.observation.iter().chain(&spec.critic_observation))
+        Self::of_fields(spec, spec.observation.iter().chain(&spec.critic_observation))
     }
 
     /// Returns the mirror of an action.
     pub fn of_actions(spec: &EnvSpec) -> Result<Self, NoMirror> {
-        Self::of_fields(&spec.action)
+        Self::of_fields(spec, &spec.action)
     }
 
-    fn of_fields<'a>(fields: impl IntoIterator<Item = &'a SpecField>) -> Result<Self, NoMirror> {
+    fn of_fields<'a>(spec: &EnvSpec, fields: impl IntoIterator<Item = &'a SpecField>) -> Result<Self, NoMirror> {
+        let is_quadruped = spec.joint_order == JOINT_NAMES;
         let mut mirror = Self { indices: Vec::new(), signs: Vec::new() };
         for field in fields {
             let start = mirror.indices.len();
-            let entries = entries(field).ok_or_else(|| NoMirror { field: field.name.clone() })?;
+            let entries = entries(field, is_quadruped).ok_or_else(|| NoMirror { field: field.name.clone() })?;
             for (index, sign) in entries {
                 mirror.indices.push(start + index);
                 mirror.signs.push(sign);
@@ -63,7 +64,9 @@ impl Mirror {
 }
 
 /// Returns source index and sign of each entry of a field. Returns `None` if the field is not known.
-fn entries(field: &SpecField) -> Option<Vec<(usize, f32)>> {
+///
+/// Joints and feet are those of a quadruped with the names of the Go2; which of another robot's face each other is not known.
+fn entries(field: &SpecField, is_quadruped: bool) -> Option<Vec<(usize, f32)>> {
     // Vectors change the sign of y, pseudovectors that of x and z.
     let signs = |signs: [f32; 3]| Some(signs.into_iter().enumerate().collect());
     match field.name.as_str() {
@@ -76,13 +79,13 @@ fn entries(field: &SpecField) -> Option<Vec<(usize, f32)>> {
         "base_height" | "phase" => Some(vec![(0, 1.0)]),
         // Stages and errors without a sign.
         "jump_stage" | "landing_error" => Some(vec![(0, 1.0), (1, 1.0)]),
-        "foot_force" => Some(Leg::ALL.map(|leg| (opposite(leg) as usize, 1.0)).to_vec()),
+        "foot_force" => is_quadruped.then(|| Leg::ALL.map(|leg| (opposite(leg) as usize, 1.0)).to_vec()),
         "joint_position" | "joint_velocity" | "previous_action" | "joint_position_offset" => {
             let joint = |joint: Joint| {
                 let sign = if joint.kind == JointKind::Hip { -1.0 } else { 1.0 };
                 (3 * opposite(joint.leg) as usize + joint.kind as usize, sign)
             };
-            (field.size == NUM_JOINTS).then(|| Joint::ALL.map(joint).to_vec())
+            is_quadruped.then(|| Joint::ALL.map(joint).to_vec())
         }
         _ => None,
     }

@@ -2,7 +2,7 @@
 
 use glam::Vec3;
 use serde::Serialize;
-use twinstep_model::{EnvSpec, FootKinematics, NUM_JOINTS, PerJoint, RobotModel, SpecField};
+use twinstep_model::{EnvSpec, Feet, SpecField};
 
 use crate::statistics::VelocityLayout;
 
@@ -81,10 +81,9 @@ pub struct Robots {
     linear_velocity: usize,
     height: usize,
     foot_force: usize,
-    feet: FootKinematics,
-    foot_radius: f32,
-    default_pose: PerJoint,
-    torque_limits: PerJoint,
+    feet: Feet,
+    default_pose: Vec<f32>,
+    torque_limits: Vec<f32>,
     action_scale: f32,
     /// Position and velocity gain by joint.
     gains: Vec<[f32; 2]>,
@@ -92,11 +91,12 @@ pub struct Robots {
 
 impl Robots {
     /// Returns the name of a quantity that is not observed, if there is one, as error.
-    pub fn new(spec: &EnvSpec, robot: &RobotModel) -> Result<Self, &'static str> {
+    pub fn new(spec: &EnvSpec, feet: &Feet, torque_limits: &[f64]) -> Result<Self, &'static str> {
         let find = |fields: &[SpecField], name: &'static str| {
             let index = fields.iter().position(|field| field.name == name).ok_or(name)?;
             Ok::<_, &'static str>(fields[..index].iter().map(|field| field.size).sum::<usize>())
         };
+        let single = |values: &[f64]| values.iter().map(|value| *value as f32).collect::<Vec<_>>();
         let (policy, critic) = (&spec.observation, &spec.critic_observation);
         Ok(Self {
             obs_len: spec.obs_len(),
@@ -112,25 +112,25 @@ impl Robots {
             linear_velocity: find(critic, "true_linear_velocity")?,
             height: find(critic, "base_height")?,
             foot_force: find(critic, "foot_force")?,
-            feet: FootKinematics::new(robot),
-            foot_radius: robot.shapes.foot_radius as f32,
-            default_pose: robot.control.default_pose_f32(),
-            torque_limits: robot.torque_limits(),
+            feet: feet.clone(),
+            default_pose: single(&spec.default_pose),
+            torque_limits: single(torque_limits),
             action_scale: spec.action_scale as f32,
-            gains: (0..NUM_JOINTS).map(|joint| spec.gains(joint).map(|gain| gain as f32)).collect(),
+            gains: (0..torque_limits.len()).map(|joint| spec.gains(joint).map(|gain| gain as f32)).collect(),
         })
     }
 
     /// Returns the mechanical power of all motors at the end of a step, without that of braking ones [W].
     fn power(&self, obs: &[f32]) -> f32 {
-        let [q, dq, action] = [self.q, self.dq, self.action].map(|start| &obs[start..start + NUM_JOINTS]);
+        let joints = self.torque_limits.len();
+        let [q, dq, action] = [self.q, self.dq, self.action].map(|start| &obs[start..start + joints]);
         let joint_power = |joint: usize| {
             let [kp, kd] = self.gains[joint];
             let tau = kp * (self.action_scale * action[joint] - q[joint]) - kd * dq[joint];
             let limit = self.torque_limits[joint];
             (tau.clamp(-limit, limit) * dq[joint]).max(0.0)
         };
-        (0..NUM_JOINTS).map(joint_power).sum()
+        (0..joints).map(joint_power).sum()
     }
 }
 
@@ -142,12 +142,17 @@ pub struct Walker {
     /// Steps since the command changed.
     steps_of_command: usize,
     command: [f32; 3],
-    air_steps: [usize; 4],
+    air_steps: Vec<usize>,
     /// Highest position of each foot in its swing phase [m].
-    peak: [f32; 4],
+    peak: Vec<f32>,
 }
 
 impl Walker {
+    /// Returns a robot with this number of feet, before its first step.
+    pub fn new(feet: usize) -> Self {
+        Self { air_steps: vec![0; feet], peak: vec![0.0; feet], ..Self::default() }
+    }
+
     /// Adds a step of robot `index` to `sums`.
     ///
     /// `observations` of all robots are those of group `policy` before and after the step, and of group `critic` after it.
@@ -181,14 +186,15 @@ impl Walker {
 
     /// Adds the motion of the feet. `rows` are the observations of both groups after the step.
     fn add_feet(&mut self, sums: &mut Sums, robots: &Robots, [obs, critic]: [&[f32]; 2], is_moving: bool) {
-        let q = std::array::from_fn(|joint| obs[robots.q + joint] + robots.default_pose[joint]);
-        let dq = std::array::from_fn(|joint| obs[robots.dq + joint]);
+        let joints = robots.default_pose.len();
+        let q = obs[robots.q..].iter().zip(&robots.default_pose).map(|(q, pose)| q + pose).collect::<Vec<_>>();
+        let dq = &obs[robots.dq..robots.dq + joints];
         let vector = |values: &[f32], start: usize| Vec3::from_slice(&values[start..start + 3]);
         // The gravity vector points down.
         let up = -vector(obs, robots.gravity);
         let (velocity, rotation) = (vector(critic, robots.linear_velocity), vector(critic, robots.angular_velocity));
-        for (leg, foot) in robots.feet.feet(&q, &dq).into_iter().enumerate() {
-            let height = critic[robots.height] + up.dot(foot.position) - robots.foot_radius;
+        for (leg, foot) in robots.feet.motions(&q, dq).enumerate() {
+            let height = critic[robots.height] + up.dot(foot.position) - robots.feet.feet()[leg].radius as f32;
             let touches = critic[robots.foot_force + leg] > CONTACT_FORCE;
             if touches {
                 let motion = velocity + rotation.cross(foot.position) + foot.velocity;
@@ -239,11 +245,11 @@ pub struct Sums {
 }
 
 impl Sums {
-    /// Returns the evaluation of `robots` robots, of which `up` did not fall in `seconds` seconds.
-    pub fn evaluation(mut self, robots: usize, up: usize, seconds: f64, policy_dt: f64) -> Evaluation {
+    /// Returns the evaluation of `count` robots, of which `up` did not fall in `seconds` seconds.
+    pub fn evaluation(mut self, count: usize, up: usize, seconds: f64, robots: &Robots) -> Evaluation {
         self.swing_heights.sort_by(f32::total_cmp);
         let moving_steps = self.moving_steps.max(1) as f64;
-        let foot_steps = 4.0 * moving_steps;
+        let foot_steps = robots.feet.len() as f64 * moving_steps;
         let [velocity_rms, yaw_rate_rms] = self.all.rms();
         let [settled_velocity_rms, settled_yaw_rate_rms] = self.settled.rms();
         let limits = [0.0].into_iter().chain(SPEED_BINS);
@@ -252,16 +258,16 @@ impl Sums {
             SpeedBin { from, share: errors.steps as f64 / self.all.steps.max(1) as f64, velocity_rms, yaw_rate_rms }
         };
         Evaluation {
-            robots,
+            robots: count,
             seconds,
-            up: up as f64 / robots as f64,
+            up: up as f64 / count as f64,
             velocity_rms,
             settled_velocity_rms,
             yaw_rate_rms,
             settled_yaw_rate_rms,
             swing_height: self.swing_heights.get(self.swing_heights.len() / 2).map_or(0.0, |height| f64::from(*height)),
             duty_factor: self.contacts as f64 / foot_steps,
-            swings_per_second: self.swing_heights.len() as f64 / (foot_steps * policy_dt),
+            swings_per_second: self.swing_heights.len() as f64 / (foot_steps * robots.policy_dt),
             slip_speed: self.slip / self.contacts.max(1) as f64,
             power: self.power / moving_steps,
             by_speed: limits.zip(&self.by_speed).map(bin).collect(),

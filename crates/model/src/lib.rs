@@ -7,7 +7,7 @@
 //! - [`VecEnv`]: a batch of environments that are reset and stepped together, in process or over a network;
 //!   [`EnvSpec`]: layouts, periods, gains and limits of an environment; [`Trajectory`]: its steps in a row.
 //! - [`Scene`]: shapes and poses for rendering; [`body_poses`]: forward kinematics;
-//!   [`FootKinematics`]: position and velocity of the feet.
+//!   [`Feet`]: position and velocity of the feet.
 //! - [`Ground`]: a plane, or a [`HeightField`] for uneven terrain.
 //! - [`RobotTree`]: a robot of any shape; [`TreeModel`]: with its actuators and contact points, as the engines simulate it.
 //! - [`mjcf()`]: the robot as a MuJoCo model.
@@ -23,7 +23,7 @@ mod base_mount;
 mod body;
 mod command;
 mod command_bounds;
-mod foot_kinematics;
+mod feet;
 pub mod frames;
 mod go2;
 mod ground;
@@ -54,7 +54,7 @@ pub use backend::{
 pub use base_mount::BaseMount;
 pub use body::RigidBody;
 pub use command::Command;
-pub use foot_kinematics::{FootKinematics, FootMotion};
+pub use feet::{Feet, Foot, FootMotion};
 pub use go2::go2;
 pub use ground::Ground;
 pub use height_field::{HeightField, HeightFieldError};
@@ -74,6 +74,6 @@ pub use scene::{Scene, SceneShape, ShapeKind};
 pub use spec::{EnvSpec, SpecDifference, SpecField};
 pub use stream::{Stream, standard_normal, stream};
 pub use trajectory::Trajectory;
-pub use tree::{RobotTree, TreeBody, TreeJoint, TreeJointKind, TreeShape, TreeShapeKind};
+pub use tree::{FreeJoint, RobotTree, TreeBody, TreeJoint, TreeJointKind, TreeShape, TreeShapeKind};
 pub use tree_model::{AsymmetricForce, ContactPoint, TreeModel};
 pub use vec_env::{AutoresetMode, EndedEpisode, EnvError, ResetRequest, StepBatch, VecEnv};

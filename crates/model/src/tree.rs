@@ -11,6 +11,8 @@ pub struct RobotTree {
     pub name: String,
     /// Whether the base moves; `None` if nothing says so.
     pub base: Option<BaseMount>,
+    /// Forces on a free base.
+    pub free_joint: FreeJoint,
     /// World-from-base of a fixed base.
     pub world_from_base: DAffine3,
     /// Bodies. The first is the base; joint `i` moves body `i + 1`.
@@ -19,6 +21,19 @@ pub struct RobotTree {
     pub joints: Vec<TreeJoint>,
     /// Collision shapes.
     pub shapes: Vec<TreeShape>,
+}
+
+/// Inertia and friction of a free base, the same for its six velocities: angular in base axes, linear in those of the world.
+///
+/// No robot has them, but files whose free joint inherits those of all joints do.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct FreeJoint {
+    /// Inertia without weight [kg and kg·m²].
+    pub armature: f64,
+    /// Coefficient of viscous friction [N·s/m and N·m·s/rad].
+    pub damping: f64,
+    /// Dry friction [N and N·m].
+    pub friction: f64,
 }
 
 /// Body with everything that is fixed to it.
@@ -185,6 +200,7 @@ impl From<&RobotModel> for RobotTree {
         Self {
             name: robot.name.clone(),
             base: Some(BaseMount::Floating),
+            free_joint: FreeJoint::default(),
             world_from_base: DAffine3::IDENTITY,
             bodies: std::iter::once(body("trunk", robot.trunk)).chain(children).collect(),
             joints: Joint::ALL.into_iter().map(|joint| tree_joint(robot, joint)).collect(),

@@ -62,6 +62,22 @@ impl TreeModel {
     }
 }
 
+impl TreeModel {
+    /// Returns the tree with the numbers of [`TreeModel::joints`]: range, limit of the torque, rotor, friction and spring.
+    #[must_use]
+    pub fn plain_tree(&self) -> RobotTree {
+        let mut tree = self.tree.clone();
+        for (own, joint) in tree.joints.iter_mut().zip(&self.joints) {
+            own.range = joint.range;
+            // A joint without actuator stays without.
+            own.effort = (joint.torque_limit > 0.0).then_some([-joint.torque_limit, joint.torque_limit]);
+            (own.armature, own.damping) = (joint.armature, joint.viscous_friction);
+            (own.friction, own.spring) = (joint.coulomb_friction, joint.spring);
+        }
+        tree
+    }
+}
+
 /// Returns true if a range is as large in both directions.
 fn is_symmetric(low: f64, high: f64) -> bool {
     low == -high || (low + high).abs() <= 1e-9 * high

@@ -29,7 +29,7 @@ use twinstep_model::RobotTree;
 
 pub use error::RobotFileError;
 pub use quadruped::{QuadrupedNames, quadruped};
-pub use write_mjcf::{TreeMjcf, write_mjcf};
+pub use write_mjcf::{TreeMjcf, geom_name, write_mjcf};
 
 /// Maximum depth of the elements of a robot file, and maximum number of its nodes.
 const MAX_DEPTH: usize = 256;

@@ -2,8 +2,8 @@
 
 use glam::DVec3;
 use twinstep_model::{
-    Contact, ControlConfig, Derating, Joint, JointKind, JointModel, Leg, LegModel, RobotModel, RobotTree, TreeJoint,
-    TreeJointKind, go2,
+    Contact, ControlConfig, Derating, FreeJoint, Joint, JointKind, JointModel, Leg, LegModel, RobotModel, RobotTree,
+    TreeJoint, TreeJointKind, go2,
 };
 
 use crate::inertia::is_real;
@@ -48,6 +48,10 @@ pub fn quadruped(
     if let Some(other) = (0..tree.joints.len()).find(|index| !found.contains(index)) {
         let problem = "it is none of the twelve joints of the legs; make it `fixed`".to_owned();
         return Err(RobotFileError::Joint { joint: tree.joints[other].name.clone(), problem });
+    }
+    if tree.free_joint != FreeJoint::default() {
+        let problem = "its free joint has armature, damping or friction; a free joint without them expected".to_owned();
+        return Err(RobotFileError::Link { link: tree.bodies[0].name.clone(), problem });
     }
     let legs = Leg::ALL.map(|leg| {
         let of = JointKind::ALL.map(|kind| found[Joint { leg, kind }.index()]);

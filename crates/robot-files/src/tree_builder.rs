@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use glam::{DAffine3, DMat3, DVec3};
-use twinstep_model::{BaseMount, RigidBody, RobotTree, TreeBody, TreeJoint, TreeShape, TreeShapeKind};
+use twinstep_model::{BaseMount, FreeJoint, RigidBody, RobotTree, TreeBody, TreeJoint, TreeShape, TreeShapeKind};
 
 use crate::inertia::{is_real, transformed};
 use crate::{RobotFile, RobotFileError};
@@ -21,8 +21,14 @@ impl TreeBuilder {
     pub fn new(name: &str, base_name: &str, base: Option<BaseMount>, world_from_base: DAffine3) -> Self {
         let bodies = vec![TreeBody { name: base_name.to_owned(), inertia: NO_BODY }];
         let name = name.to_owned();
-        let tree = RobotTree { name, base, world_from_base, bodies, joints: Vec::new(), shapes: Vec::new() };
+        let (free_joint, joints, shapes) = (FreeJoint::default(), Vec::new(), Vec::new());
+        let tree = RobotTree { name, base, free_joint, world_from_base, bodies, joints, shapes };
         Self { tree, notes: Vec::new() }
+    }
+
+    /// Sets inertia and friction of the free base.
+    pub fn set_free_joint(&mut self, free_joint: FreeJoint) {
+        self.tree.free_joint = free_joint;
     }
 
     /// Adds the body that a joint moves. Returns its index.

@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use glam::{DAffine3, DMat3, DQuat, DVec3};
 use twinstep_model::{
-    BaseMount, CONTACT, Contact, MjcfActuator, RobotTree, TreeJoint, TreeJointKind, TreeShape, TreeShapeKind,
+    BaseMount, CONTACT, Contact, FreeJoint, MjcfActuator, RobotTree, TreeJoint, TreeJointKind, TreeShape, TreeShapeKind,
 };
 
 /// Settings of the MuJoCo model of a tree.
@@ -17,12 +17,14 @@ pub struct TreeMjcf {
     /// Joint positions [rad or m] of the keyframe `start`, in which the lowest contact point of a free robot touches the ground; `None`
     /// for no keyframe.
     pub start: Option<Vec<f64>>,
+    /// Contact with the ground.
+    pub contact: Contact,
 }
 
 impl Default for TreeMjcf {
     /// 1 kHz, torque control, no keyframe.
     fn default() -> Self {
-        Self { timestep: 0.001, actuator: MjcfActuator::Torque, start: None }
+        Self { timestep: 0.001, actuator: MjcfActuator::Torque, start: None, contact: CONTACT }
     }
 }
 
@@ -41,7 +43,7 @@ pub fn write_mjcf(tree: &RobotTree, options: &TreeMjcf) -> String {
         .line(1, &format!("<option timestep=\"{timestep}\" gravity=\"0 0 -9.81\" cone=\"elliptic\" impratio=\"30\"/>"));
     // The shapes of the robot touch only the ground.
     writer.line(1, "<default>");
-    let Contact { friction, time_constant, damping_ratio } = CONTACT;
+    let Contact { friction, time_constant, damping_ratio } = options.contact;
     let contact =
         format!("friction=\"{friction} 0 0\" solref=\"{} {damping_ratio}\"", time_constant.max(2.0 * timestep));
     writer.line(2, &format!("<joint solreflimit=\"{} 1\"/>", 2.0 * timestep));
@@ -80,11 +82,16 @@ impl Writer<'_> {
         self.tree.base.unwrap_or(default) == BaseMount::Floating
     }
 
+    /// Returns true if the base is the world itself: it never moves, has no mass, and is at the origin.
+    fn is_world(&self) -> bool {
+        let tree = self.tree;
+        !self.is_free() && tree.bodies[0].inertia.mass == 0.0 && tree.world_from_base == DAffine3::IDENTITY
+    }
+
     /// Writes a body and those below it. `offset` is the origin of the parent of the tree in the body that was written for it [m].
     fn body(&mut self, index: usize, offset: DVec3, depth: usize) {
         let joint = index.checked_sub(1).map(|joint| &self.tree.joints[joint]);
-        // A base that never moves and has no mass is the world itself.
-        let is_world = index == 0 && !self.is_free() && self.tree.bodies[0].inertia.mass == 0.0;
+        let is_world = index == 0 && self.is_world();
         let inner = depth + usize::from(!is_world);
         if !is_world {
             let pose = joint.map_or(self.tree.world_from_base, |joint| {
@@ -95,7 +102,7 @@ impl Writer<'_> {
             self.line(depth, &format!("<body name=\"{name}\"{}>", placed(pose)));
         }
         if index == 0 && self.is_free() {
-            self.line(inner, "<freejoint/>");
+            self.line(inner, &free_joint(&self.tree.free_joint));
         }
         let (mut last, mut at) = (index, DVec3::ZERO);
         if let Some(joint) = joint {
@@ -132,8 +139,8 @@ impl Writer<'_> {
             let (place, mass) = (numbers(&(offset + inertia.com).to_array()), inertia.mass);
             self.line(depth, &format!("<inertial pos=\"{place}\" mass=\"{mass}\" fullinertia=\"{full}\"/>"));
         }
-        for shape in self.tree.shapes.iter().filter(|shape| shape.body == index) {
-            self.shape(shape, offset, depth);
+        for (number, shape) in self.tree.shapes.iter().enumerate().filter(|(_, shape)| shape.body == index) {
+            self.shape(number, shape, offset, depth);
         }
         for (child, joint) in self.tree.joints.iter().enumerate() {
             if joint.parent == index {
@@ -168,7 +175,7 @@ impl Writer<'_> {
         self.line(depth, &(text + "/>"));
     }
 
-    fn shape(&mut self, shape: &TreeShape, offset: DVec3, depth: usize) {
+    fn shape(&mut self, number: usize, shape: &TreeShape, offset: DVec3, depth: usize) {
         let (kind, size) = match shape.kind {
             TreeShapeKind::Box(half) => ("box", half.to_array().to_vec()),
             TreeShapeKind::Sphere(radius) => ("sphere", vec![radius]),
@@ -180,7 +187,10 @@ impl Writer<'_> {
         let (size, place) = (numbers(&size), placed(DAffine3::from_translation(offset) * shape.body_from_shape));
         // Shapes that do not touch the ground in the batch engine do not touch it here.
         let touches = if matches!(kind, "ellipsoid" | "cylinder") { " conaffinity=\"0\"" } else { "" };
-        self.line(depth, &format!("<geom type=\"{kind}\" size=\"{size}\"{place}{touches}/>"));
+        self.line(
+            depth,
+            &format!("<geom name=\"{}\" type=\"{kind}\" size=\"{size}\"{place}{touches}/>", geom_name(number)),
+        );
     }
 
     fn motor(&mut self, joint: &TreeJoint) {
@@ -206,6 +216,11 @@ impl Writer<'_> {
     }
 }
 
+/// Returns the name of the geom of shape `number` of the tree.
+pub fn geom_name(number: usize) -> String {
+    format!("shape{number}")
+}
+
 /// Returns the attributes of a pose.
 fn placed(pose: DAffine3) -> String {
     let mut text = String::new();
@@ -227,4 +242,12 @@ fn numbers(values: &[f64]) -> String {
 
 fn escaped(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('"', "&quot;")
+}
+
+fn free_joint(joint: &FreeJoint) -> String {
+    let FreeJoint { armature, damping, friction } = joint;
+    if *joint == FreeJoint::default() {
+        return "<freejoint/>".to_owned();
+    }
+    format!("<joint type=\"free\" armature=\"{armature}\" damping=\"{damping}\" frictionloss=\"{friction}\"/>")
 }

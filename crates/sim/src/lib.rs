@@ -31,7 +31,7 @@ mod tree_simulation;
 pub use batch::{BatchBackend, BatchSnapshot, SimdPrecision};
 pub use config::{Engine, RoughTerrain, SimConfig, SimConfigError, StepTerrain, Terrain};
 pub use error::BackendBuildError;
-pub use mujoco::{MujocoBackend, MujocoPlant};
+pub use mujoco::{MujocoBackend, MujocoPlant, effect_outside_mujoco};
 pub use placement::Placement;
 pub use rapier::{RapierBackend, RobotSnapshot};
 pub use rollout::BatchRollout;

@@ -1,7 +1,7 @@
 //! Initial state of a robot of any tree.
 
-use glam::DQuat;
-use twinstep_model::{BaseMount, InitialState, RobotTree};
+use glam::{DQuat, DVec3};
+use twinstep_model::{BaseMount, Ground, InitialState, RobotTree, TreeModel};
 
 use crate::tree_error::{TreeError, check_finite, check_joints};
 
@@ -51,6 +51,25 @@ impl Placement {
         }
     }
 
+    /// Returns the state at rest with the joints at `q`: a fixed base where its file has it, a free one upright above the origin, with the
+    /// contact points of the robot on or above the ground.
+    pub fn standing_on(ground: &Ground, robot: &TreeModel, q: Vec<f64>) -> Self {
+        let mut state = Self::of(&robot.tree, q);
+        if robot.tree.base.is_some_and(BaseMount::is_fixed) {
+            return state;
+        }
+        let poses = robot.tree.base_from_bodies(&state.q);
+        let needed = robot.points.iter().map(|point| {
+            let DVec3 { x, y, z } = poses[point.body].transform_point3(point.centre);
+            f64::from(ground.height(x as f32, y as f32)) + point.radius - z
+        });
+        let height = needed.fold(f64::NEG_INFINITY, f64::max);
+        if height.is_finite() {
+            state.base_position[2] = height;
+        }
+        state
+    }
+
     /// Checks the state for a robot with this number of joints.
     pub(crate) fn check(&self, num_joints: usize) -> Result<(), TreeError> {
         check_joints("q", self.q.iter().copied(), num_joints)?;
@@ -77,8 +96,8 @@ impl From<&InitialState> for Placement {
 
 #[cfg(test)]
 mod tests {
-    use glam::{DAffine3, DVec3};
-    use twinstep_model::go2;
+    use glam::DAffine3;
+    use twinstep_model::{TreeShape, TreeShapeKind, go2};
 
     use super::*;
 
@@ -93,5 +112,23 @@ mod tests {
         assert!(DQuat::from_xyzw(x, y, z, w).angle_between(turn) < 1e-6);
         let free = RobotTree { base: Some(BaseMount::Floating), ..tree };
         assert_eq!(Placement::of(&free, vec![0.0; 12]).base_orientation, [1.0, 0.0, 0.0, 0.0]);
+    }
+
+    #[test]
+    fn robot_stands_on_the_highest_ground_under_its_points() {
+        let shape = |body: usize| TreeShape {
+            name: String::new(),
+            body,
+            kind: TreeShapeKind::Sphere(0.02),
+            body_from_shape: DAffine3::from_translation(DVec3::new(0.0, 0.0, -0.2)),
+        };
+        let tree = RobotTree { shapes: [3, 6, 9, 12].map(shape).to_vec(), ..RobotTree::from(&go2()) };
+        let robot = TreeModel::new(tree).expect("equal limits");
+        let q = go2().control.default_pose.to_vec();
+        let flat = Placement::standing_on(&Ground::FLAT, &robot, q.clone()).base_position[2];
+        assert!((flat - robot.tree.standing_height(&q)).abs() < 1e-9);
+        let raised = Ground { point: [0.0, 0.0, 0.3], ..Ground::FLAT };
+        let height = Placement::standing_on(&raised, &robot, q).base_position[2];
+        assert!((height - flat - 0.3).abs() < 1e-6, "{height}");
     }
 }

@@ -8,6 +8,7 @@ use crate::actuator_input::ActuatorInput;
 use crate::ground_shapes::GroundShapes;
 use crate::robot_world::{RobotWorld, WorldRobot};
 use crate::tree_engine::{TreeCommand, TreeEngine, TreeReadings};
+use crate::tree_error::TreeError;
 use crate::{Placement, SimConfig};
 
 /// Robots of one tree.
@@ -37,9 +38,15 @@ impl RapierTrees {
 }
 
 impl TreeEngine for RapierTrees {
-    fn place(&mut self, robot: usize, model: &TreeModel, state: &Placement) {
+    fn place(&mut self, robot: usize, model: &TreeModel, state: &Placement) -> Result<(), TreeError> {
         let model = WorldRobot::of_tree(model, self.actuator_dt);
         self.worlds[robot] = RobotWorld::new(&model, &self.config, &self.ground, state);
+        Ok(())
+    }
+
+    fn push(&mut self, robot: usize, velocity: [f32; 3]) -> Result<(), TreeError> {
+        self.worlds[robot].push(velocity);
+        Ok(())
     }
 
     fn read(&self, robot: usize, readings: &mut TreeReadings) {
@@ -52,7 +59,7 @@ impl TreeEngine for RapierTrees {
         [periods, steps]: [usize; 2],
         states: &mut [TreeReadings],
         parallel: bool,
-    ) {
+    ) -> Result<(), TreeError> {
         let Self { worlds, shapes, .. } = self;
         let one = |(world, (command, readings)): (&mut RobotWorld, (&TreeCommand, &mut TreeReadings))| {
             let mut input = SimdCommands::zero::<f64>(command.q.len());
@@ -68,6 +75,7 @@ impl TreeEngine for RapierTrees {
         } else {
             worlds.iter_mut().zip(commands.iter().zip(states)).for_each(one);
         }
+        Ok(())
     }
 }
 

@@ -67,9 +67,17 @@ impl TreeCommand {
 /// Engine that simulates robots of one tree.
 pub(crate) trait TreeEngine: Send {
     /// Resets a robot to a state, with the parameters of `model`.
-    fn place(&mut self, robot: usize, model: &TreeModel, state: &Placement);
+    fn place(&mut self, robot: usize, model: &TreeModel, state: &Placement) -> Result<(), TreeError>;
+    /// Adds a velocity [m/s] to that of a robot's base, in the world frame. It has no effect on a fixed base.
+    fn push(&mut self, robot: usize, velocity: [f32; 3]) -> Result<(), TreeError>;
     /// Copies the readings of a robot.
     fn read(&self, robot: usize, readings: &mut TreeReadings);
     /// Advances every robot by `count`: actuator periods, physics steps of each. Runs on the threads of the current pool if `parallel`.
-    fn advance(&mut self, commands: &[TreeCommand], count: [usize; 2], states: &mut [TreeReadings], parallel: bool);
+    fn advance(
+        &mut self,
+        commands: &[TreeCommand],
+        count: [usize; 2],
+        states: &mut [TreeReadings],
+        parallel: bool,
+    ) -> Result<(), TreeError>;
 }

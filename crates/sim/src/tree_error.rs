@@ -33,6 +33,26 @@ pub enum TreeError {
         /// Number of robots.
         num_robots: usize,
     },
+    /// MuJoCo does not simulate an effect.
+    #[error("the engine `mujoco` does not simulate the effect `{effect}` of robot `{name}`; `batch` does")]
+    UnsupportedEffect {
+        /// Name of the robot.
+        name: String,
+        /// The effect.
+        effect: &'static str,
+    },
+    /// The process of MuJoCo has failed.
+    #[error("the process of the engine `mujoco` has failed: {reason}")]
+    Process {
+        /// What it says.
+        reason: String,
+    },
+    /// A fixed base cannot be pushed.
+    #[error("the base of robot `{name}` is fixed; only a floating one can be pushed")]
+    FixedBase {
+        /// Name of the robot.
+        name: String,
+    },
     /// A robot has other bodies, joint axes or shapes than the first one.
     #[error("robot `{name}` has another tree than the simulated ones: {what}")]
     OtherTree {

@@ -1,12 +1,13 @@
-//! Robots of any tree, in the batch engine or in rapier.
+//! Robots of any tree, in one of the three engines.
 
 use std::sync::Arc;
 
 use twinstep_dynamics::tree::TreeStructure;
-use twinstep_model::TreeModel;
+use twinstep_model::{FreeJoint, TreeModel};
 use twinstep_simd::InstructionSet;
 
 use crate::batch::{SimdPrecision, tree_batches};
+use crate::mujoco::MujocoTrees;
 use crate::rapier_trees::RapierTrees;
 use crate::thread_pool::thread_pool;
 use crate::tree_engine::{TreeCommand, TreeEngine, TreeReadings};
@@ -22,14 +23,15 @@ pub struct TreeSimulation {
     pool: Option<Arc<rayon::ThreadPool>>,
     /// Physics steps per actuator period.
     steps: usize,
+    has_fixed_base: bool,
 }
 
 impl TreeSimulation {
     /// Creates `num_robots` robots in a state, whose actuators have the rate `actuator_hz` [Hz], in single precision and the widest
     /// registers.
     ///
-    /// The base of `robot` moves if `config` says floating and the robot's tree does not fix it. Fails if the engine of `config` is
-    /// MuJoCo, if the robot has no joint, and if a setting or the initial state is not allowed.
+    /// The base of `robot` moves if `config` says floating and the robot's tree does not fix it. Fails if the engine of `config` does not
+    /// simulate an effect of the robot, if the robot has no joint, and if a setting or the initial state is not allowed.
     pub fn new(
         robot: &TreeModel,
         config: &SimConfig,
@@ -41,7 +43,7 @@ impl TreeSimulation {
         Self::with_precision(robot, config, actuator_hz, precision, num_robots, initial_state)
     }
 
-    /// Creates robots like [`TreeSimulation::new`], in the given precision. rapier has single precision only.
+    /// Creates robots like [`TreeSimulation::new`], in the given precision. Only the batch engine has a choice.
     pub fn with_precision(
         robot: &TreeModel,
         config: &SimConfig,
@@ -60,16 +62,19 @@ impl TreeSimulation {
             _ if robot.joints.is_empty() => {
                 return Err(refused("robot", &robot.tree.name, "a robot with joints").into());
             }
+            Engine::Rapier if robot.tree.free_joint != FreeJoint::default() => {
+                let allowed = "`batch` for a robot whose free joint has armature, damping or friction";
+                return Err(refused("engine", "rapier", allowed).into());
+            }
             Engine::Batch => tree_batches(precision, robot, &config, 1.0 / actuator_hz, num_robots, initial_state),
             Engine::Rapier => Box::new(RapierTrees::new(robot, &config, 1.0 / actuator_hz, num_robots, initial_state)),
-            Engine::Mujoco => {
-                return Err(refused("engine", "mujoco", "`batch` or `rapier` for a robot of any tree").into());
-            }
+            Engine::Mujoco => Box::new(MujocoTrees::new(robot, &config, actuator_hz, num_robots, initial_state)?),
         };
         let pool = if config.threads == 1 { None } else { Some(thread_pool(config.threads)?) };
         let mut states = vec![TreeReadings::zero(robot); num_robots];
         states.iter_mut().enumerate().for_each(|(robot, readings)| engine.read(robot, readings));
-        Ok(Self { engine, states, robot: robot.clone(), pool, steps: config.steps_per_actuator_period(actuator_hz) })
+        let (steps, has_fixed_base) = (config.steps_per_actuator_period(actuator_hz), config.base.is_fixed());
+        Ok(Self { engine, states, robot: robot.clone(), pool, steps, has_fixed_base })
     }
 
     /// Returns the number of robots.
@@ -84,7 +89,20 @@ impl TreeSimulation {
         }
         check_tree(&self.robot, model)?;
         state.check(model.joints.len())?;
-        self.engine.place(robot, model, state);
+        self.engine.place(robot, model, state)?;
+        self.engine.read(robot, &mut self.states[robot]);
+        Ok(())
+    }
+
+    /// Adds a velocity [m/s] to that of a robot's base, in the world frame. Fails if the base is fixed.
+    pub fn push(&mut self, robot: usize, velocity: [f32; 3]) -> Result<(), TreeError> {
+        if robot >= self.num_robots() {
+            return Err(TreeError::RobotOutOfRange { robot, num_robots: self.num_robots() });
+        }
+        if self.has_fixed_base {
+            return Err(TreeError::FixedBase { name: self.robot.tree.name.clone() });
+        }
+        self.engine.push(robot, velocity)?;
         self.engine.read(robot, &mut self.states[robot]);
         Ok(())
     }
@@ -102,7 +120,6 @@ impl TreeSimulation {
             Some(pool) => pool.install(|| engine.advance(commands, count, states, true)),
             None => engine.advance(commands, count, states, false),
         }
-        Ok(())
     }
 
     /// Returns the readings of every robot.
@@ -161,6 +178,8 @@ mod tests {
         let nan = TreeCommand::hold(vec![f32::NAN; 12], 1.0, 0.0);
         let error = robots.step(&[nan.clone(), nan], 1).expect_err("NaN");
         assert_eq!(error.to_string(), "`q` of entry 0 is NaN; finite numbers are expected");
+        let error = robots.push(2, [1.0, 0.0, 0.0]).expect_err("two robots");
+        assert_eq!(error.to_string(), "robot 2 does not exist; the number of robots is 2");
         let error = robots.reset(2, &robot(), &start()).expect_err("two robots");
         assert_eq!(error.to_string(), "robot 2 does not exist; the number of robots is 2");
         assert_eq!(robots.states(), before);
@@ -175,10 +194,28 @@ mod tests {
     }
 
     #[test]
-    fn mujoco_is_no_engine_of_a_tree() {
+    fn effect_that_mujoco_does_not_simulate_is_refused_before_its_process_starts() {
         let config = SimConfig { engine: Engine::Mujoco, ..SimConfig::default() };
-        let error = TreeSimulation::new(&robot(), &config, 200.0, 1, &start()).err().expect("refused").to_string();
-        assert!(error.contains("`batch` or `rapier` for a robot of any tree"), "{error}");
+        let mut worn = robot();
+        worn.joints[3].actuator.backlash = 0.01;
+        let error = TreeSimulation::new(&worn, &config, 200.0, 1, &start()).err().expect("refused").to_string();
+        assert!(error.contains("the engine `mujoco` does not simulate the effect `backlash`"), "{error}");
+    }
+
+    #[test]
+    fn pushed_robot_moves_in_both_engines_and_one_on_a_stand_is_not_pushed() {
+        for engine in [Engine::Batch, Engine::Rapier] {
+            let mut robots = simulation(engine);
+            robots.push(1, [0.5, -0.2, 0.0]).expect("it floats");
+            let command = TreeCommand::hold(start().q.iter().map(|q| *q as f32).collect(), 20.0, 0.5);
+            robots.step(&[command.clone(), command], 1).expect("two commands");
+            let speeds = [0, 1].map(|robot| robots.states()[robot].state.base_linear_velocity);
+            assert!(speeds[0][0].abs() < 0.02 && (speeds[1][0] - 0.5).abs() < 0.02, "{engine:?}: {speeds:?}");
+        }
+        let config = SimConfig { base: twinstep_model::BaseMount::Fixed, threads: 1, ..SimConfig::default() };
+        let mut stand = TreeSimulation::new(&robot(), &config, 200.0, 1, &start()).expect("one robot");
+        let error = stand.push(0, [0.5, 0.0, 0.0]).expect_err("on a stand").to_string();
+        assert_eq!(error, "the base of robot `go2` is fixed; only a floating one can be pushed");
     }
 
     /// A heavier robot falls as fast, but turns its joints less. The neighbour in the next lane is the same as before.

@@ -97,14 +97,15 @@ for _task, _max_episode_steps in _MAX_EPISODE_STEPS.items():
         max_episode_steps=_max_episode_steps,
         kwargs={"task": _task},
     )
-# Any robot: `model=` is its model file, such as that of a humanoid or an arm.
-gymnasium.register(
-    id="twinstep/Pose-v0",
-    entry_point="twinstep.env:Go2Env",
-    vector_entry_point="twinstep.vector_env:Go2VectorEnv",
-    max_episode_steps=1000,
-    kwargs={"task": "pose"},
-)
+# Any robot: `robot=` is a shipped one, such as "g1", or its model file.
+for _task in ("pose", "walk"):
+    gymnasium.register(
+        id=f"twinstep/{_task.capitalize()}-v0",
+        entry_point="twinstep.env:Go2Env",
+        vector_entry_point="twinstep.vector_env:Go2VectorEnv",
+        max_episode_steps=1000,
+        kwargs={"task": _task},
+    )
 
 if not TYPE_CHECKING:
     # For a type checker, this function would make every name an attribute of the package.

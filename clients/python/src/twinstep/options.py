@@ -19,8 +19,9 @@ class ConnectOptions:
     endpoint
         Zenoh endpoint of a server, a robot or a router. ``None`` starts the bundled server.
     robot
-        Name of the robot. Required if several are visible at ``endpoint``. Among several servers of the same robot,
-        task and spec hash, that with the most free environments is chosen.
+        With ``endpoint``: name of the robot, required if several are visible. Among several servers of the same robot,
+        task and spec hash, that with the most free environments is chosen. Without: robot of the bundled server, a
+        shipped one (``"go2"``, ``"g1"``, ``twinstep serve --help``) or its model file.
     task
         Name of the task. A server at ``endpoint`` must have this task.
     config, model
@@ -57,6 +58,8 @@ class ConnectOptions:
         """Check the options that do not depend on a server."""
         if self.endpoint is not None and (self.config is not None or self.model is not None):
             raise InvalidOptionError("`config` and `model` are options of the bundled server: omit them or `endpoint`")
+        if self.endpoint is None and self.robot is not None and self.model is not None:
+            raise InvalidOptionError("`robot` and `model` are both the robot of the bundled server: omit one of them")
         for name in ("timeout_s", "reset_timeout_s", "connect_timeout_s"):
             value = getattr(self, name)
             if not value > 0:
@@ -68,8 +71,9 @@ def server_flags(options: ConnectOptions) -> tuple[str, ...]:
     flags = ["--task", options.task, "--envs", _CAPACITY]
     if options.config is not None:
         flags += ["--config", options.config]
-    if options.model is not None:
-        flags += ["--model", options.model]
+    model = options.robot if options.model is None else options.model
+    if model is not None and model != "go2":
+        flags += ["--model", model]
     if options.shared_memory:
         flags.append("--shared-memory")
     return tuple(flags)

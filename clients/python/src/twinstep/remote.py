@@ -71,7 +71,8 @@ class RemoteVecEnv(NotPicklable):
             assert endpoint is not None
             connection = Connection(
                 endpoint,
-                robot=options.robot,
+                # The bundled server has one robot, whatever its name.
+                robot=None if options.endpoint is None else options.robot,
                 zenoh_config=options.zenoh_config,
                 shared_memory=options.shared_memory,
                 server=server,

@@ -54,7 +54,9 @@ pub fn inverse_dynamics<T: SimdFloat>(
         tau[joint] = axis.dot(forces[joint + 1]) + parameters.armature[joint] * acceleration.ddq[joint];
         forces[parent] = forces[parent].plus(forces[joint + 1]);
     }
-    TreeForces { moment: forces[0].angular, force: forces[0].linear, tau }
+    let of_free_joint = of_base.scaled(parameters.base_armature);
+    let base = forces[0].plus(of_free_joint);
+    TreeForces { moment: base.angular, force: base.linear, tau }
 }
 
 /// Returns the symmetric mass matrix, row by row, in the order angular and linear velocity of a free base in base axes, joint
@@ -84,6 +86,7 @@ pub fn mass_matrix<T: SimdFloat>(
         for (column, entry) in entries.into_iter().enumerate().take(row + 1) {
             (matrix[row][column], matrix[column][row]) = (entry, entry);
         }
+        matrix[row][row] += parameters.base_armature;
     }
     matrix
 }

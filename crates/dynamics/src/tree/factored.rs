@@ -77,11 +77,14 @@ impl<T: SimdFloat> FactoredTree<T> {
         if structure.is_free {
             let BodyMotion { inertia, force: Spatial { angular, linear }, .. } = &motion.bodies[0];
             let (own, [a, b, c], [d, e, f]) = (spatial_matrix(inertia), angular.0, linear.0);
+            let damping = parameters.base_damping;
+            let velocity = state.base_velocity();
             for (i, force) in [a, b, c, d, e, f].into_iter().enumerate() {
-                rhs[i] -= force * dt;
+                rhs[i] -= (force + damping * velocity[i]) * dt;
                 for j in 0..=i {
                     block[i][j] += own[i][j];
                 }
+                block[i][i] += parameters.base_armature + damping * dt;
             }
             self.base = Cholesky::new(block);
             self.base_u = self.base.forward(rhs);

@@ -73,6 +73,10 @@ pub struct TreeParameters<T> {
     pub places: Vec<Place<T>>,
     /// Rotor inertia reflected to each joint [kg·m² or kg].
     pub armature: Vec<T>,
+    /// Inertia without weight of a free base [kg and kg·m²].
+    pub base_armature: T,
+    /// Coefficient of viscous friction of a free base [N·s/m and N·m·s/rad].
+    pub base_damping: T,
 }
 
 impl<T: SimdFloat> TreeParameters<T> {
@@ -85,6 +89,8 @@ impl<T: SimdFloat> TreeParameters<T> {
             bodies: vec![Inertia::splat(&empty); joints + 1],
             places: vec![Place::identity(); joints],
             armature: vec![T::splat(0.0); joints],
+            base_armature: T::splat(0.0),
+            base_damping: T::splat(0.0),
         };
         for lane in 0..T::LANES {
             parameters.set(lane, robot);
@@ -96,6 +102,8 @@ impl<T: SimdFloat> TreeParameters<T> {
     pub fn set(&mut self, lane: usize, robot: &RobotTree) {
         let robot = robot.with_parallel_frames();
         let turns = turns(&robot);
+        self.base_armature.set(lane, robot.free_joint.armature);
+        self.base_damping.set(lane, robot.free_joint.damping);
         for (body, (ours, turn)) in robot.bodies.iter().zip(self.bodies.iter_mut().zip(&turns)) {
             let RigidBody { mass, com, inertia } = body.inertia;
             let back = turn.transpose();

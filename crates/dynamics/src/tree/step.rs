@@ -36,7 +36,7 @@ impl<T: SimdFloat> StepEquations<T> for TreeEquations<T> {
     }
 
     fn visit(parameters: &mut TreeParameters<T>, mut visit: impl FnMut(&mut T)) {
-        let TreeParameters { bodies, places, armature, .. } = parameters;
+        let TreeParameters { bodies, places, armature, base_armature, base_damping, .. } = parameters;
         for body in bodies {
             visit(&mut body.mass);
             body.moment.0.iter_mut().chain(&mut body.about_origin).for_each(&mut visit);
@@ -44,7 +44,7 @@ impl<T: SimdFloat> StepEquations<T> for TreeEquations<T> {
         for place in places {
             place.axes.iter_mut().chain([&mut place.origin]).flat_map(|vector| &mut vector.0).for_each(&mut visit);
         }
-        armature.iter_mut().for_each(visit);
+        armature.iter_mut().chain([base_armature, base_damping]).for_each(visit);
     }
 
     fn point_of_body(robot: &TreeModel, body: usize, point: DVec3) -> DVec3 {

@@ -9,6 +9,8 @@ mod actuator_network;
 mod effect_table;
 mod error;
 mod tree;
+mod tree_shapes;
+mod tree_text;
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -20,7 +22,9 @@ use twinstep_model::RobotModel;
 
 pub use actuator_network::{ActuatorNetworkConfig, MemberSampling, NetworkMode};
 pub use error::{EffectEntryError, ModelFileError};
-pub use tree::{JointEffect, JointScope, NominalGain, TreeModelFile};
+pub use tree::{JointEffect, JointScope, TreeModelFile};
+pub use tree_shapes::ShapeText;
+pub use tree_text::{NominalGain, TreeGroups};
 
 use crate::nominal::{ControlTable, JointsTable, NominalRobot, NominalRobotError, is_robot_file};
 use crate::shipped_robots::{read_to_string, resolved};

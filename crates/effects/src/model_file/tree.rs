@@ -4,13 +4,14 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::path::Path;
 
-use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 use twinstep_model::{JOINT_NAMES, JointModel, MjcfOptions, NUM_JOINTS, TreeModel, go2, mjcf};
 use twinstep_robot_files::read_robot;
 
 use super::effect_table::{EffectTable, key_error, read_table, write_table};
 use super::error::{EffectEntryError, ModelFileError};
+use super::tree_shapes::{ShapeText, with_shapes};
+use super::tree_text::{Control, Joints, NominalGain, Pose, TreeGroups, TreeText};
 use crate::nominal::{BUILT_IN, JointsTable, NominalRobotError, is_robot_file};
 use crate::shipped_robots::{read_to_string, resolved};
 use crate::{Apply, CATALOGUE, Effect};
@@ -36,28 +37,12 @@ pub struct TreeModelFile {
     pub action_scale: Option<f64>,
     /// Joint positions to which actions are relative [rad]. Joints that are left out: 0, or the nearest position in their range.
     pub default_pose: BTreeMap<String, f64>,
+    /// Links and joints that tasks need, by name.
+    pub groups: TreeGroups,
+    /// Collision shapes that replace those of the robot file, by link.
+    pub shapes: BTreeMap<String, Vec<ShapeText>>,
     /// Effects, in the order of the file.
     pub effects: Vec<JointEffect>,
-}
-
-/// A gain for all joints, or one for each.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(untagged, expecting = "a number, or a table with a number for each joint, such as { elbow = 20.0 }")]
-pub enum NominalGain {
-    /// One gain for all joints.
-    All(f64),
-    /// Gains by joint.
-    PerJoint(BTreeMap<String, f64>),
-}
-
-impl NominalGain {
-    /// Returns the gain of a joint; `None` if it is unknown.
-    pub fn of(&self, joint: &str) -> Option<f64> {
-        match self {
-            Self::All(gain) => Some(*gain),
-            Self::PerJoint(gains) => gains.get(joint).copied(),
-        }
-    }
 }
 
 /// Effect at joints, with its values.
@@ -91,65 +76,6 @@ impl fmt::Display for JointScope {
     }
 }
 
-#[derive(Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct TreeText {
-    robot: String,
-    #[serde(default, skip_serializing_if = "is_default")]
-    control: Control,
-    #[serde(default, skip_serializing_if = "is_default")]
-    joints: Joints,
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    effect: Vec<Table>,
-}
-
-fn is_default<T: Default + PartialEq>(table: &T) -> bool {
-    *table == T::default()
-}
-
-#[derive(Default, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Control {
-    #[serde(skip_serializing_if = "Option::is_none")]
-    kp: Option<NominalGain>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    kd: Option<NominalGain>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    actuator_hz: Option<f64>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    policy_hz: Option<f64>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    action_scale: Option<f64>,
-    #[serde(default, skip_serializing_if = "is_default")]
-    default_pose: Pose,
-}
-
-/// Default pose: by joint, or as in the model file of a quadruped, in the order FL, FR, RL, RR; hip, thigh, calf.
-#[derive(Clone, PartialEq, Serialize, Deserialize)]
-#[serde(
-    untagged,
-    expecting = "a table with a position for each joint, such as { elbow = 0.5 }, or the twelve positions of a quadruped"
-)]
-enum Pose {
-    PerJoint(BTreeMap<String, f64>),
-    Quadruped([f64; NUM_JOINTS]),
-}
-
-impl Default for Pose {
-    fn default() -> Self {
-        Self::PerJoint(BTreeMap::new())
-    }
-}
-
-#[derive(Default, PartialEq, Serialize, Deserialize)]
-struct Joints {
-    #[serde(default)]
-    rename: BTreeMap<String, String>,
-    /// Names of the joints of a quadruped, and its feet, which a tree does not need.
-    #[serde(flatten)]
-    of_quadruped: JointsTable,
-}
-
 impl TreeModelFile {
     /// Returns the ideal Go2, whose gains are unknown.
     pub fn go2() -> Self {
@@ -170,6 +96,8 @@ impl TreeModelFile {
             policy_hz: None,
             action_scale: None,
             default_pose: BTreeMap::new(),
+            groups: TreeGroups::default(),
+            shapes: BTreeMap::new(),
             effects: Vec::new(),
         }
     }
@@ -179,7 +107,9 @@ impl TreeModelFile {
         let Ok(table) = text.parse::<Table>() else { return false };
         let is_table =
             |name: &str, key: &str| table.get(name).and_then(|table| table.get(key)).is_some_and(Value::is_table);
-        is_table("joints", "rename") || ["kp", "kd", "default_pose"].iter().any(|key| is_table("control", key))
+        ["groups", "shapes"].iter().any(|key| table.contains_key(*key))
+            || is_table("joints", "rename")
+            || ["kp", "kd", "default_pose"].iter().any(|key| is_table("control", key))
     }
 
     /// Reads a model file, or a robot file (URDF, MJCF) as a model without effects. Paths in it become absolute.
@@ -200,7 +130,7 @@ impl TreeModelFile {
 
     fn parse_in(folder: &Path, text: &str, name: &str) -> Result<Self, ModelFileError> {
         let malformed = |message: String| ModelFileError::Malformed { name: name.to_owned(), message };
-        let TreeText { robot, control, joints, effect } =
+        let TreeText { robot, control, joints, groups, shapes, effect } =
             toml::from_str(text).map_err(|error| malformed(error.to_string()))?;
         let mut file = if robot == BUILT_IN { Self::go2() } else { Self::read_robot_file(&robot, folder, name)? };
         file.rename_joints(joints.rename).map_err(malformed)?;
@@ -223,6 +153,10 @@ impl TreeModelFile {
             Pose::Quadruped(pose) => file.quadruped_pose(pose, joints.of_quadruped.names).map_err(malformed)?,
         };
         file.check_pose(&default_pose).map_err(malformed)?;
+        file.check_groups(&groups).map_err(malformed)?;
+        file.groups = groups;
+        file.nominal = with_shapes(file.nominal, &shapes).map_err(malformed)?;
+        file.shapes = shapes;
         (file.kp, file.kd, file.actuator_hz) = (kp, kd, actuator_hz);
         (file.policy_hz, file.action_scale, file.default_pose) = (policy_hz, action_scale, default_pose);
         for (index, table) in effect.iter().enumerate() {
@@ -319,6 +253,19 @@ impl TreeModelFile {
         Ok(())
     }
 
+    fn check_groups(&self, groups: &TreeGroups) -> Result<(), String> {
+        let tree = &self.nominal.tree;
+        let mut feet = groups.foot.iter().flatten();
+        if let Some(foot) = feet.find(|foot| !tree.bodies.iter().any(|body| body.name == **foot)) {
+            let links: Vec<_> = tree.bodies.iter().map(|body| body.name.as_str()).collect();
+            return Err(format!("`groups.foot`: the robot has no link `{foot}`; its links are {}", links.join(", ")));
+        }
+        match groups.hip.iter().flatten().find(|hip| tree.joint(hip).is_none()) {
+            Some(hip) => Err(format!("`groups.hip`: the robot has no joint `{hip}`; {}", self.joints_are())),
+            None => Ok(()),
+        }
+    }
+
     /// Returns the default pose of all joints [rad].
     pub fn pose(&self) -> Vec<f64> {
         let joints = self.nominal.tree.joints.iter().zip(&self.nominal.joints);
@@ -384,8 +331,19 @@ impl TreeModelFile {
 
     /// Returns the text of the file. [`TreeModelFile::parse`] reads exactly the same model from it.
     pub fn to_toml(&self) -> String {
-        let TreeModelFile { robot, rename, kp, kd, actuator_hz, policy_hz, action_scale, default_pose, .. } =
-            self.clone();
+        let TreeModelFile {
+            robot,
+            rename,
+            kp,
+            kd,
+            actuator_hz,
+            policy_hz,
+            action_scale,
+            default_pose,
+            groups,
+            shapes,
+            ..
+        } = self.clone();
         let head = TreeText {
             robot,
             control: Control {
@@ -397,6 +355,8 @@ impl TreeModelFile {
                 default_pose: Pose::PerJoint(default_pose),
             },
             joints: Joints { rename, of_quadruped: JointsTable::default() },
+            groups,
+            shapes,
             effect: Vec::new(),
         };
         let mut text = toml::to_string(&head).expect("numbers by names");
@@ -505,6 +465,10 @@ mod tests {
         assert!(error.contains("`control.actuator_hz` is 5; 20 to 2000 Hz expected"), "{error}");
         let error = refusal("[control.default_pose]\nelbow_flex = 3\n");
         assert!(error.contains("`control.default_pose.elbow_flex` is 3; -1.69 to 1.69 expected"), "{error}");
+        let error = refusal("[groups]\nfoot = [\"toe\"]\n");
+        assert!(error.contains("`groups.foot`: the robot has no link `toe`; its links are base"), "{error}");
+        let error = refusal("[groups]\nhip = [\"toe\"]\n");
+        assert!(error.contains("`groups.hip`: the robot has no joint `toe`; its joints are"), "{error}");
         let error = refusal("[[effect]]\nname = \"payload\"\nscope = \"base\"\nmass_kg = 1\nposition_m = [0, 0, 0]\n");
         assert!(error.contains("an effect of joints, because the robot is not like the Go2"), "{error}");
         let error = refusal("[[effect]]\nname = \"backlash\"\nscope = \"all\"\ngap_rad = nan\n");

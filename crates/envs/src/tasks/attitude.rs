@@ -7,7 +7,7 @@
 use std::f32::consts::TAU;
 
 use rand::RngExt;
-use twinstep_model::{EnvSpec, PerJoint, RobotModel, Stream, frames};
+use twinstep_model::{EnvSpec, RobotModel, Stream, frames};
 
 use super::attitude_config::AttitudeConfig;
 use super::walk::{Walk, WalkState};
@@ -24,7 +24,7 @@ pub struct Attitude {
     config: AttitudeConfig,
     walk: Walk,
     spec: EnvSpec,
-    default_pose: PerJoint,
+    default_pose: Vec<f32>,
 }
 
 /// State of an episode of `attitude`.
@@ -53,13 +53,13 @@ impl Attitude {
                     .clone_into(&mut field.description);
             }
         }
-        Ok(Self { default_pose: robot.control.default_pose_f32(), walk, spec, config })
+        Ok(Self { default_pose: robot.control.default_pose_f32().to_vec(), walk, spec, config })
     }
 
     /// Returns roll [rad], pitch [rad] and height [m] of the reference at a time since the start [s].
     fn reference(&self, state: &AttitudeState, time: f32) -> [f32; 3] {
         let [roll, pitch, height] = state.sines.map(|[amplitude, hz]| amplitude * (TAU * hz * time).sin());
-        [roll, pitch, self.config.walk.target_base_height_m + height]
+        [roll, pitch, self.walk.target_base_height() + height]
     }
 
     fn policy_dt(&self) -> f32 {
@@ -80,7 +80,7 @@ impl Task for Attitude {
         &self.spec
     }
 
-    fn start(&self, random: &mut Stream) -> (PerJoint, AttitudeState) {
+    fn start(&self, random: &mut Stream) -> (Vec<f32>, AttitudeState) {
         let (q, walk) = self.walk.start(random);
         let AttitudeConfig { roll_rad, pitch_rad, height_m, frequency_hz: [low, high], .. } = self.config;
         let sines = [roll_rad, pitch_rad, height_m].map(|largest| {
@@ -89,7 +89,7 @@ impl Task for Attitude {
         (q, AttitudeState { walk, sines, time: 0.0 })
     }
 
-    fn observe(&self, state: &AttitudeState, robot: &RobotView, action: &PerJoint, obs: &mut [f32]) {
+    fn observe(&self, state: &AttitudeState, robot: &RobotView, action: &[f32], obs: &mut [f32]) {
         observe(robot, self.reference(state, state.time + self.policy_dt()), &self.default_pose, action, obs);
     }
 
@@ -105,10 +105,10 @@ impl Task for Attitude {
         let has_fallen = self.walk.evaluate(&mut state.walk, step, random, &mut terms[..of_walk]);
         let [roll, pitch, height] = self.reference(state, state.time);
         let robot = &step.robot;
-        let [is_roll, is_pitch] = roll_and_pitch(robot.measured.orientation[robot.index]);
+        let [is_roll, is_pitch] = roll_and_pitch(robot.orientation);
         let error = (roll - is_roll).powi(2) + (pitch - is_pitch).powi(2);
         terms[of_walk] = config.track_attitude * (-error / config.attitude_sigma).exp() * dt;
-        if let Some(truth) = robot.truth {
+        if let Some(truth) = &robot.truth {
             let error = (height - base_height(robot, truth)).powi(2);
             terms[of_walk + 1] = config.track_height * (-error / config.height_sigma).exp() * dt;
         }
@@ -150,13 +150,13 @@ mod tests {
         let mut terms = vec![f32::NAN; task.spec().reward_terms.len()];
         let (mut largest, of_walk) = (0.0f32, task.walk.spec().reward_terms.len());
         for length in 1..=500 {
-            let robot = RobotView { measured: &states.measured, truth: None, ground: &ground, index: 0 };
+            let robot = RobotView::of(&states.measured, None, &ground, 0);
             task.observe(&state, &robot, &action, &mut obs);
             let [roll, pitch, height] = [obs[6], obs[7], obs[8]];
             largest = largest.max(roll.abs()).max(pitch.abs());
             states.measured.orientation[0] = orientation(0.4, pitch, roll);
             states.truth.base_position[0] = [0.0, 0.0, height];
-            let robot = RobotView { measured: &states.measured, truth: Some(&states.truth), ground: &ground, index: 0 };
+            let robot = RobotView::of(&states.measured, Some(&states.truth), &ground, 0);
             let step = Step { robot, action: &action, previous_action: &action, previous_dq: &action, length };
             assert!(!task.evaluate(&mut state, &step, &mut random, &mut terms));
             assert!((terms[of_walk] - 0.08).abs() < 1e-4 && (terms[of_walk + 1] - 0.02).abs() < 1e-4, "{terms:?}");

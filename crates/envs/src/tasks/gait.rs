@@ -4,16 +4,16 @@
 //! it needs motion capture.
 
 use rand::RngExt;
-use twinstep_model::{EnvSpec, FootKinematics, GaitCommand, GroundTruth, PerJoint, RobotModel, SpecField, Stream};
+use twinstep_model::{EnvSpec, Feet, GaitCommand, RobotModel, SpecField, Stream};
 
 use super::gait_clock::GaitClock;
 use super::gait_config::{GaitConfig, RewardWeights};
 use super::gait_reward::RewardInput;
 use super::walk::{Walk, WalkState};
 use crate::config::ConfigError;
-use crate::feet::foot_states;
+use crate::feet::{foot_states, per_leg};
 use crate::observation::OBS_LEN;
-use crate::task::{RobotView, Step, Task};
+use crate::task::{RobotView, Step, Task, Truth};
 
 /// The task `gait` on one robot model.
 #[derive(Clone, Debug)]
@@ -21,7 +21,7 @@ pub struct GaitTask {
     config: GaitConfig,
     walk: Walk,
     spec: EnvSpec,
-    feet: FootKinematics,
+    feet: Feet,
     foot_radius: f32,
     has_ground_truth: bool,
     resample_steps: u32,
@@ -59,7 +59,7 @@ impl GaitTask {
         }
         let resample_steps = (config.walk.command_resample_s / spec.policy_dt as f32).round().max(1.0) as u32;
         Ok(Self {
-            feet: FootKinematics::new(robot),
+            feet: Feet::from(robot),
             foot_radius: robot.shapes.foot_radius as f32,
             has_ground_truth,
             resample_steps,
@@ -77,16 +77,16 @@ impl GaitTask {
         clock.phase_offset = gait.phase_offset();
     }
 
-    fn reward_input<'a>(&self, clock: &GaitClock, robot: &RobotView, truth: &'a GroundTruth) -> RewardInput<'a> {
+    fn reward_input<'a>(&self, clock: &GaitClock, robot: &RobotView, truth: &Truth<'a>) -> RewardInput<'a> {
         let (phases, schedule) = (clock.foot_phases(), self.config.schedule());
         let feet = foot_states(&self.feet, robot, truth);
         let height = |phase| self.foot_radius + self.config.swing_height_m * schedule.swing_height(phase);
         RewardInput {
             policy_dt: self.spec.policy_dt as f32,
             desired_contact: phases.map(|phase| schedule.desired_contact(phase)),
-            foot_force: &truth.foot_force[robot.index],
-            foot_speed: feet.map(|foot| foot.horizontal_speed.hypot(foot.vertical_velocity)),
-            foot_height: feet.map(|foot| foot.height),
+            foot_force: truth.foot_force,
+            foot_speed: per_leg(feet.iter().map(|foot| foot.horizontal_speed.hypot(foot.vertical_velocity))),
+            foot_height: per_leg(feet.iter().map(|foot| foot.height)),
             target_foot_height: phases.map(height),
             force_sigma: self.config.force_sigma,
             velocity_sigma: self.config.velocity_sigma,
@@ -105,14 +105,14 @@ impl Task for GaitTask {
         &self.spec
     }
 
-    fn start(&self, random: &mut Stream) -> (PerJoint, GaitState) {
+    fn start(&self, random: &mut Stream) -> (Vec<f32>, GaitState) {
         let (q, walk) = self.walk.start(random);
         let mut clock = GaitClock { phase: random.random(), ..GaitClock::default() };
         self.draw_gait(&mut clock, random);
         (q, GaitState { walk, clock, steps_to_gait: Some(random.random_range(1..=self.resample_steps)) })
     }
 
-    fn observe(&self, state: &GaitState, robot: &RobotView, action: &PerJoint, obs: &mut [f32]) {
+    fn observe(&self, state: &GaitState, robot: &RobotView, action: &[f32], obs: &mut [f32]) {
         let (of_walk, own) = obs.split_at_mut(OBS_LEN);
         self.walk.observe(&state.walk, robot, action, of_walk);
         own[0] = state.clock.step_frequency;
@@ -128,7 +128,7 @@ impl Task for GaitTask {
         state.clock.advance(self.spec.policy_dt as f32);
         let (of_walk, own) = terms.split_at_mut(self.walk.spec().reward_terms.len());
         let has_fallen = self.walk.evaluate(&mut state.walk, step, random, of_walk);
-        if let Some(truth) = step.robot.truth.filter(|_| self.has_ground_truth) {
+        if let Some(truth) = step.robot.truth.as_ref().filter(|_| self.has_ground_truth) {
             let input = self.reward_input(&state.clock, &step.robot, truth);
             own.copy_from_slice(&self.config.reward.evaluate(&input));
         }
@@ -183,7 +183,7 @@ mod tests {
         let start = state.clock.phase;
         let (mut obs, action) = (vec![f32::NAN; task.spec().obs_len()], [0.0; 12]);
         let mut terms = vec![f32::NAN; task.spec().reward_terms.len()];
-        let robot = RobotView { measured: &states.measured, truth: Some(&states.truth), ground: &ground, index: 0 };
+        let robot = RobotView::of(&states.measured, Some(&states.truth), &ground, 0);
         for length in 1..=10 {
             let step = Step { robot, action: &action, previous_action: &action, previous_dq: &action, length };
             assert!(!task.evaluate(&mut state, &step, &mut random, &mut terms));
@@ -199,12 +199,12 @@ mod tests {
     #[test]
     fn standing_robot_has_the_velocity_term_and_half_of_its_feet_are_too_heavy() {
         let (task, ground, states) = (task(true), Ground::FLAT, standing());
-        let robot = RobotView { measured: &states.measured, truth: Some(&states.truth), ground: &ground, index: 0 };
+        let robot = RobotView::of(&states.measured, Some(&states.truth), &ground, 0);
         let clock = GaitClock { phase: 0.25, step_frequency: 2.5, phase_offset: Gait::Trot.phase_offset() };
-        let terms = task.config.reward.evaluate(&task.reward_input(&clock, &robot, &states.truth));
+        let terms = task.config.reward.evaluate(&task.reward_input(&clock, &robot, &robot.truth.expect("a simulator")));
         // Two of four feet are to be on the ground.
         assert!(terms[0] < 1e-3 && (terms[1] - 4.0 * 0.5 * 0.02).abs() < 2e-3, "{terms:?}");
-        let feet = task.feet.feet(&states.measured.q[0], &[0.0; 12]);
+        let feet: Vec<_> = task.feet.motions(&states.measured.q[0], &[0.0; 12]).collect();
         let error = |leg: usize| (feet[leg].position.z + 0.3 - task.foot_radius - 0.08).powi(2);
         // FR and RL are in the middle of their swing phases.
         let expected = -30.0 * (error(1) + error(2)) * 0.02;

@@ -10,7 +10,7 @@ pub struct RewardInput<'a> {
     /// Probability with which each foot is to be on the ground.
     pub desired_contact: PerLeg,
     /// Normal force on each foot [N].
-    pub foot_force: &'a PerLeg,
+    pub foot_force: &'a [f32],
     /// Speed of each foot [m/s].
     pub foot_speed: PerLeg,
     /// Height of each foot's centre above the ground under it [m].

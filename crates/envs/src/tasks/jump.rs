@@ -6,17 +6,17 @@
 
 use glam::Vec3;
 use rand::RngExt;
-use twinstep_model::{EnvSpec, FootKinematics, GroundTruth, PerJoint, RobotModel, SpecField, Stream, frames};
+use twinstep_model::{EnvSpec, Feet, RobotModel, SpecField, Stream, frames};
 
 use super::jump_config::{JumpConfig, RewardWeights};
 use super::jump_flight::{Flight, JumpMotion, Stage};
 use super::jump_reward::{LandingError, RewardInput};
 use super::walk::{Walk, WalkState};
 use crate::config::{ConfigError, Range};
-use crate::feet::foot_states;
+use crate::feet::{foot_states, per_leg};
 use crate::observation::{CRITIC_OBS_LEN, OBS_LEN, observe, observe_privileged};
 use crate::path::GroundPose;
-use crate::task::{RobotView, Step, Task};
+use crate::task::{RobotView, Step, Task, Truth};
 
 /// Bound of the target and of errors in the observation [m, rad].
 const TARGET_BOUND: f32 = 5.0;
@@ -30,8 +30,8 @@ pub struct Jump {
     walk: Walk,
     spec: EnvSpec,
     has_ground_truth: bool,
-    default_pose: PerJoint,
-    feet: FootKinematics,
+    default_pose: Vec<f32>,
+    feet: Feet,
     foot_radius: f32,
 }
 
@@ -79,8 +79,8 @@ impl Jump {
             ]);
         }
         Ok(Self {
-            default_pose: robot.control.default_pose_f32(),
-            feet: FootKinematics::new(robot),
+            default_pose: robot.control.default_pose_f32().to_vec(),
+            feet: Feet::from(robot),
             foot_radius: robot.shapes.foot_radius as f32,
             has_ground_truth,
             walk,
@@ -89,25 +89,22 @@ impl Jump {
         })
     }
 
-    fn motion(&self, robot: &RobotView, truth: &GroundTruth) -> (JumpMotion, [f32; 4]) {
-        let (measured, index) = (robot.measured, robot.index);
-        let world_from_base = frames::world_from_base(measured.orientation[index]);
-        let base = Vec3::from(truth.base_position[index]);
-        let velocity = Vec3::from(truth.base_linear_velocity[index]);
-        let angular_velocity = world_from_base * Vec3::from(truth.base_angular_velocity[index]);
+    fn motion(&self, robot: &RobotView, truth: &Truth) -> (JumpMotion, [f32; 4]) {
+        let world_from_base = frames::world_from_base(robot.orientation);
+        let base = Vec3::from(truth.base_position);
+        let angular_velocity = world_from_base * Vec3::from(truth.base_angular_velocity);
         let feet = foot_states(&self.feet, robot, truth);
         let forward = world_from_base * Vec3::X;
         let motion = JumpMotion {
             pose: GroundPose { x: base.x, y: base.y, yaw: forward.y.atan2(forward.x) },
             height: base.z - robot.ground.height(base.x, base.y),
-            velocity: velocity.to_array(),
+            velocity: truth.base_linear_velocity,
             yaw_rate: angular_velocity.z,
-            foot_clearance: feet.map(|foot| (foot.height - self.foot_radius).max(0.0)),
-            foot_velocity_z: feet.map(|foot| foot.vertical_velocity),
-            foot_force: truth.foot_force[index],
+            foot_clearance: per_leg(feet.iter().map(|foot| (foot.height - self.foot_radius).max(0.0))),
+            foot_velocity_z: per_leg(feet.iter().map(|foot| foot.vertical_velocity)),
+            foot_force: per_leg(truth.foot_force.iter().copied()),
         };
-        let in_base = self.feet.feet(&measured.q[index], &measured.dq[index]);
-        (motion, in_base.map(|foot| foot.position.z))
+        (motion, per_leg(self.feet.motions(robot.q, robot.dq).map(|foot| foot.position.z)))
     }
 
     /// Returns the terms that `walk` does not have, and advances the jump.
@@ -115,7 +112,7 @@ impl Jump {
         &self,
         state: &mut JumpState,
         robot: &RobotView,
-        truth: &GroundTruth,
+        truth: &Truth,
     ) -> [f32; RewardWeights::NAMES.len()] {
         let (config, policy_dt) = (&self.config, self.spec.policy_dt as f32);
         let (motion, foot_z) = self.motion(robot, truth);
@@ -137,7 +134,7 @@ impl Jump {
             takeoff_error_yaw: motion.yaw_rate - state.target.yaw / flight_time,
             foot_z,
             target_foot_z: config.target_foot_z_m,
-            q: &robot.measured.q[robot.index],
+            q: robot.q,
             default_pose: &self.default_pose,
             speed: vx.hypot(vy),
         })
@@ -159,7 +156,7 @@ impl Task for Jump {
         &self.spec
     }
 
-    fn start(&self, random: &mut Stream) -> (PerJoint, JumpState) {
+    fn start(&self, random: &mut Stream) -> (Vec<f32>, JumpState) {
         let (q, mut walk) = self.walk.start(random);
         self.walk.set_velocity_command(&mut walk, [0.0; 3]);
         let JumpConfig { target_x_m, target_y_m, target_yaw_rad, .. } = self.config;
@@ -168,7 +165,7 @@ impl Task for Jump {
         (q, JumpState { walk, target, ..JumpState::default() })
     }
 
-    fn observe(&self, state: &JumpState, robot: &RobotView, action: &PerJoint, obs: &mut [f32]) {
+    fn observe(&self, state: &JumpState, robot: &RobotView, action: &[f32], obs: &mut [f32]) {
         observe(robot, [0.0; 3], &self.default_pose, action, obs);
         let GroundPose { x, y, yaw } = state.target;
         let phase = (state.time / self.config.phase_s).min(1.0);
@@ -176,7 +173,7 @@ impl Task for Jump {
     }
 
     fn observe_critic(&self, state: &JumpState, robot: &RobotView, obs: &mut [f32]) {
-        let Some(truth) = robot.truth else { return };
+        let Some(truth) = &robot.truth else { return };
         observe_privileged(robot, truth, obs);
         let stage = |stage| f32::from(u8::from(state.flight.stage() == stage));
         let LandingError { distance, yaw } = state.error;
@@ -188,7 +185,7 @@ impl Task for Jump {
         state.time += self.spec.policy_dt as f32;
         let (of_walk, own) = terms.split_at_mut(self.walk.spec().reward_terms.len());
         let has_fallen = self.walk.evaluate(&mut state.walk, step, random, of_walk);
-        if let Some(truth) = step.robot.truth.filter(|_| self.has_ground_truth) {
+        if let Some(truth) = step.robot.truth.as_ref().filter(|_| self.has_ground_truth) {
             own.copy_from_slice(&self.evaluate_jump(state, &step.robot, truth));
         }
         has_fallen
@@ -212,7 +209,8 @@ mod tests {
         let height = (2.0 * time - 4.905 * time * time).clamp(0.0, 1.0);
         let robot = go2();
         let q = robot.control.default_pose_f32();
-        let foot = FootKinematics::new(&robot).feet(&q, &[0.0; 12])[0].position.z - robot.shapes.foot_radius as f32;
+        let foot = Feet::from(&robot).motions(&q, &[0.0; 12]).next().expect("four");
+        let foot = foot.position.z - robot.shapes.foot_radius as f32;
         states.measured.q[0] = q;
         states.truth.base_position[0] = [1.5 * time.max(0.0), 0.0, height - foot];
         states.truth.base_linear_velocity[0] = [1.5, 0.0, 2.0 - 9.81 * time];
@@ -227,8 +225,7 @@ mod tests {
         let names = &task.spec().reward_terms;
         let steps = (-5..40).map(|step| {
             let states = jumping_robot(0.02 * step as f32 + 0.005);
-            let robot =
-                RobotView { measured: &states.measured, truth: Some(&states.truth), ground: &Ground::FLAT, index: 0 };
+            let robot = RobotView::of(&states.measured, Some(&states.truth), &Ground::FLAT, 0);
             let action = [0.0; 12];
             let input = Step { robot, action: &action, previous_action: &action, previous_dq: &action, length: 1 };
             let mut terms = vec![f32::NAN; names.len()];
@@ -263,11 +260,11 @@ mod tests {
         let half = std::f32::consts::FRAC_PI_4;
         states.measured.orientation[0] = [half.cos(), 0.0, 0.0, half.sin()];
         states.truth.base_angular_velocity[0] = [0.0, 3.0, 0.7];
-        let robot = RobotView { measured: &states.measured, truth: Some(&states.truth), ground: &ground, index: 0 };
-        let (motion, foot_z) = task.motion(&robot, &states.truth);
+        let robot = RobotView::of(&states.measured, Some(&states.truth), &ground, 0);
+        let (motion, foot_z) = task.motion(&robot, &robot.truth.expect("a simulator"));
         assert!((motion.pose.yaw - 2.0 * half).abs() < 1e-6 && (motion.yaw_rate - 0.7).abs() < 1e-6);
         // Nose down: v_z = v_z of the base − ω_y · x of the foot in the base frame.
-        let feet = task.feet.feet(&states.measured.q[0], &states.measured.dq[0]);
+        let feet: Vec<_> = task.feet.motions(&states.measured.q[0], &states.measured.dq[0]).collect();
         for leg in 0..4 {
             let expected = states.truth.base_linear_velocity[0][2] - 3.0 * feet[leg].position.x;
             assert!((motion.foot_velocity_z[leg] - expected).abs() < 1e-5, "{motion:?}");
@@ -280,7 +277,7 @@ mod tests {
         let (task, ground) = (task(true), Ground::FLAT);
         let (state, _) = jump(&task);
         let states = jumping_robot(0.1);
-        let robot = RobotView { measured: &states.measured, truth: Some(&states.truth), ground: &ground, index: 0 };
+        let robot = RobotView::of(&states.measured, Some(&states.truth), &ground, 0);
         let mut obs = vec![f32::NAN; task.spec().obs_len()];
         task.observe(&state, &robot, &[0.0; 12], &mut obs);
         // 45 steps of 20 ms, and 1 s from phase 0 to 1.
@@ -296,7 +293,7 @@ mod tests {
         assert_eq!(real.spec().hash(), simulated.spec().hash());
         assert!(!real.spec().reward_terms.iter().any(|name| name == "success"));
         let states = RobotStates::new(1);
-        let robot = RobotView { measured: &states.measured, truth: None, ground: &Ground::FLAT, index: 0 };
+        let robot = RobotView::of(&states.measured, None, &Ground::FLAT, 0);
         let (action, mut random) = ([0.0; 12], stream(0, "test", 0));
         let mut state = real.start(&mut random).1;
         let input = Step { robot, action: &action, previous_action: &action, previous_dq: &action, length: 1 };

@@ -56,7 +56,7 @@ impl Default for JumpConfig {
             reward: RewardWeights::default(),
             walk: WalkConfig {
                 max_episode_s: 3.0,
-                min_base_height_m: 0.1,
+                min_base_height_m: Some(0.1),
                 reset_joint_noise_rad: 0.05,
                 reward: penalties,
                 ..WalkConfig::default()

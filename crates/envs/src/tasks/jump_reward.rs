@@ -1,6 +1,6 @@
 //! Reward terms of the task `jump`, one function each: U2E, Table II, and those that densify the reward.
 
-use twinstep_model::{Joint, JointKind, Leg, PerJoint, PerLeg};
+use twinstep_model::{Joint, JointKind, Leg, PerLeg};
 
 use super::jump_flight::Stage;
 
@@ -54,9 +54,9 @@ pub struct RewardInput<'a> {
     /// Height of the feet in flight relative to the base [m].
     pub target_foot_z: f32,
     /// Joint position [rad].
-    pub q: &'a PerJoint,
+    pub q: &'a [f32],
     /// Joint position of the default pose [rad].
-    pub default_pose: &'a PerJoint,
+    pub default_pose: &'a [f32],
     /// Horizontal speed of the base [m/s].
     pub speed: f32,
 }
@@ -141,7 +141,7 @@ pub fn recovery(input: &RewardInput<'_>) -> f32 {
 mod tests {
     use super::*;
 
-    const ZERO: PerJoint = [0.0; 12];
+    const ZERO: [f32; 12] = [0.0; 12];
 
     fn input() -> RewardInput<'static> {
         RewardInput {

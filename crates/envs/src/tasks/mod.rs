@@ -30,7 +30,7 @@ pub use gait_clock::Gait;
 pub use gait_config::GaitConfig;
 pub use jump::Jump;
 pub use jump_config::JumpConfig;
-pub use pose::{ControlledRobot, PoseState, PoseTask, TreeView};
+pub use pose::{PoseState, PoseTask};
 pub use pose_config::PoseConfig;
 pub use track::Track;
 pub use track_config::TrackConfig;

@@ -5,14 +5,14 @@
 
 use glam::Vec3;
 use rand::RngExt;
-use twinstep_model::{EnvSpec, GroundTruth, PerJoint, RobotModel, SpecField, Stream, frames};
+use twinstep_model::{EnvSpec, RobotModel, SpecField, Stream, frames};
 
 use super::track_config::TrackConfig;
 use super::walk::{Walk, WalkState};
 use crate::config::ConfigError;
 use crate::observation::{OBS_LEN, observe};
 use crate::path::{GroundPose, Path, PathShape};
-use crate::task::{RobotView, Step, Task};
+use crate::task::{RobotView, Step, Task, Truth};
 
 /// Bound of the pose error in the observation [m, rad].
 const ERROR_BOUND: f32 = 3.2;
@@ -27,7 +27,7 @@ pub struct Track {
     config: TrackConfig,
     walk: Walk,
     spec: EnvSpec,
-    default_pose: PerJoint,
+    default_pose: Vec<f32>,
 }
 
 /// State of an episode of `track`.
@@ -65,11 +65,11 @@ impl Track {
             description: "pose of the path's reference in the base frame: forward, left, yaw; 0 without motion capture"
                 .to_owned(),
         });
-        Ok(Self { default_pose: robot.control.default_pose_f32(), walk, spec, config })
+        Ok(Self { default_pose: robot.control.default_pose_f32().to_vec(), walk, spec, config })
     }
 
     /// Returns the pose of the reference in the frame of the robot: forward [m], left [m], yaw [rad].
-    fn error(state: &TrackState, robot: &RobotView, truth: &GroundTruth) -> [f32; 3] {
+    fn error(state: &TrackState, robot: &RobotView, truth: &Truth) -> [f32; 3] {
         state.reference.relative_to(ground_pose(robot, truth))
     }
 
@@ -85,9 +85,9 @@ impl Track {
 }
 
 /// Returns the pose of a robot's base on the ground.
-fn ground_pose(robot: &RobotView, truth: &GroundTruth) -> GroundPose {
-    let [x, y, _] = truth.base_position[robot.index];
-    let forward = frames::world_from_base(robot.measured.orientation[robot.index]) * Vec3::X;
+fn ground_pose(robot: &RobotView, truth: &Truth) -> GroundPose {
+    let [x, y, _] = truth.base_position;
+    let forward = frames::world_from_base(robot.orientation) * Vec3::X;
     GroundPose { x, y, yaw: forward.y.atan2(forward.x) }
 }
 
@@ -98,7 +98,7 @@ impl Task for Track {
         &self.spec
     }
 
-    fn start(&self, random: &mut Stream) -> (PerJoint, TrackState) {
+    fn start(&self, random: &mut Stream) -> (Vec<f32>, TrackState) {
         let (q, walk) = self.walk.start(random);
         let TrackConfig { path: shape, radius_m, speed, start_offset_m, start_offset_rad, .. } = self.config;
         let commands = &self.config.walk.command;
@@ -114,9 +114,9 @@ impl Task for Track {
         (q, TrackState { walk, path, time: 0.0, reference })
     }
 
-    fn observe(&self, state: &TrackState, robot: &RobotView, action: &PerJoint, obs: &mut [f32]) {
+    fn observe(&self, state: &TrackState, robot: &RobotView, action: &[f32], obs: &mut [f32]) {
         observe(robot, state.path.velocity(state.time), &self.default_pose, action, obs);
-        let truth = robot.truth.filter(|_| self.config.observe_pose_error);
+        let truth = robot.truth.as_ref().filter(|_| self.config.observe_pose_error);
         let error = truth.map_or([0.0; 3], |truth| Self::error(state, robot, truth));
         for (entry, error) in obs[OBS_LEN..].iter_mut().zip(error) {
             *entry = error.clamp(-ERROR_BOUND, ERROR_BOUND);
@@ -131,7 +131,7 @@ impl Task for Track {
         let (config, dt) = (&self.config, self.spec.policy_dt as f32);
         state.reference = state.path.advance(state.reference, state.time, dt);
         state.time += dt;
-        let error = step.robot.truth.map(|truth| Self::error(state, &step.robot, truth));
+        let error = step.robot.truth.as_ref().map(|truth| Self::error(state, &step.robot, truth));
         let target = self.target_velocity(state, error.unwrap_or_default());
         self.walk.set_velocity_command(&mut state.walk, target);
         let of_walk = self.walk.spec().reward_terms.len();
@@ -168,7 +168,7 @@ mod tests {
     }
 
     fn view<'a>(states: &'a RobotStates, ground: &'a Ground) -> RobotView<'a> {
-        RobotView { measured: &states.measured, truth: Some(&states.truth), ground, index: 0 }
+        RobotView::of(&states.measured, Some(&states.truth), ground, 0)
     }
 
     #[test]

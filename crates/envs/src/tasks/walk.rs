@@ -1,12 +1,13 @@
 //! The task `walk`: the robot follows a velocity command.
 
 use rand::RngExt;
-use twinstep_model::{EnvSpec, FootKinematics, GroundTruth, PerJoint, RobotModel, Stream, frames};
+use twinstep_model::{EnvSpec, RobotModel, Stream, frames};
 
+use crate::ControlledRobot;
 use crate::config::ConfigError;
-use crate::feet::{FootContacts, foot_states};
+use crate::feet::{FootContacts, FootState, foot_states};
 use crate::observation::{
-    base_height, base_spec, linear_velocity_in_base, observe, observe_privileged, privileged_fields,
+    base_height, linear_velocity_in_base, observe, observe_privileged, policy_fields, privileged_fields_of, spec_of,
 };
 use crate::reward::{NEED_GROUND_TRUTH, RewardInput};
 use crate::task::{RobotView, Step, Task};
@@ -19,13 +20,16 @@ const SOFT_JOINT_LIMIT_FACTOR: f32 = 0.9;
 #[derive(Clone, Debug)]
 pub struct Walk {
     config: WalkConfig,
+    robot: ControlledRobot,
     spec: EnvSpec,
     /// Indices of the reward terms in the spec. Without ground truth some are missing.
     terms: Vec<usize>,
-    default_pose: PerJoint,
-    feet: FootKinematics,
-    soft_lower: PerJoint,
-    soft_upper: PerJoint,
+    default_pose: Vec<f32>,
+    /// Lower and upper limits of the joints.
+    soft_limits: [Vec<f32>; 2],
+    torque_scale: f32,
+    target_base_height: f32,
+    min_base_height: f32,
     resample_steps: u32,
     /// Cosine of the tilt below which the episode terminates.
     cos_max_tilt: f32,
@@ -42,35 +46,48 @@ pub struct WalkState {
 }
 
 impl Walk {
-    /// Creates the task for `robot`. A backend without ground truth has neither a critic group nor the reward terms of
-    /// [`NEED_GROUND_TRUTH`], and its episodes do not end by the height of the base.
+    /// Creates the task for a quadruped.
     pub fn new(config: WalkConfig, robot: &RobotModel, has_ground_truth: bool) -> Result<Self, ConfigError> {
+        Self::of(config, ControlledRobot::from(robot), has_ground_truth)
+    }
+
+    /// Creates the task for a robot with feet. A backend without ground truth has neither a critic group nor the reward terms of
+    /// [`NEED_GROUND_TRUTH`], and its episodes do not end by the height of the base.
+    pub fn of(config: WalkConfig, robot: ControlledRobot, has_ground_truth: bool) -> Result<Self, ConfigError> {
         config.check()?;
         let known = |name: &str| has_ground_truth || !NEED_GROUND_TRUTH.contains(&name);
         let terms: Vec<usize> =
             (0..RewardWeights::NAMES.len()).filter(|term| known(RewardWeights::NAMES[*term])).collect();
         let names = terms.iter().map(|term| RewardWeights::NAMES[*term].to_owned()).collect();
-        let mut spec = base_spec("walk", robot, names, config.max_episode_s);
+        let mut spec = spec_of("walk", &robot, policy_fields(robot.joints.len()), names, config.max_episode_s);
         if has_ground_truth {
-            spec.critic_observation = privileged_fields();
+            let feet: Vec<_> = robot.feet.feet().iter().map(|foot| foot.name.as_str()).collect();
+            spec.critic_observation = privileged_fields_of(&feet);
         }
-        let (lower, upper) = (robot.lower_limits(), robot.upper_limits());
-        let margin = |j: usize| {
-            let margin = (1.0 - SOFT_JOINT_LIMIT_FACTOR) / 2.0 * (upper[j] - lower[j]);
-            // A joint without limits has none within them.
-            if margin.is_finite() { margin } else { 0.0 }
-        };
+        let [target_base_height, min_base_height] = config.heights(&robot)?;
         Ok(Self {
             terms,
-            default_pose: robot.control.default_pose_f32(),
-            feet: FootKinematics::new(robot),
-            soft_lower: std::array::from_fn(|j| lower[j] + margin(j)),
-            soft_upper: std::array::from_fn(|j| upper[j] - margin(j)),
+            default_pose: robot.default_pose_f32(),
+            soft_limits: soft_limits(&robot),
+            torque_scale: robot.torque_scale() as f32,
+            target_base_height,
+            min_base_height,
             resample_steps: (config.command_resample_s / spec.policy_dt as f32).round().max(1.0) as u32,
             cos_max_tilt: config.max_tilt_rad.cos(),
+            robot,
             spec,
             config,
         })
+    }
+
+    /// Returns the robot.
+    pub fn robot(&self) -> &ControlledRobot {
+        &self.robot
+    }
+
+    /// Returns the height of the base without a penalty [m].
+    pub fn target_base_height(&self) -> f32 {
+        self.target_base_height
     }
 
     fn draw_command(&self, random: &mut Stream) -> [f32; 3] {
@@ -81,47 +98,60 @@ impl Walk {
             .map(|[low, high]| factor * (low + (high - low) * random.random::<f32>()))
     }
 
-    fn reward_input<'a>(&'a self, state: &mut WalkState, step: &'a Step, is_terminated: bool) -> RewardInput<'a> {
+    fn reward_input<'a>(
+        &'a self,
+        state: &'a WalkState,
+        step: &'a Step,
+        feet: &'a [FootState],
+        is_terminated: bool,
+    ) -> RewardInput<'a> {
         let robot = &step.robot;
-        let (measured, index) = (robot.measured, robot.index);
-        let policy_dt = self.spec.policy_dt as f32;
         // Terms that need the ground truth are not in `terms` where there is none.
-        let of_truth =
-            |value: fn(&RobotView, &GroundTruth) -> f32| robot.truth.map_or(0.0, |truth| value(robot, truth));
-        let velocity = robot.truth.map(|truth| linear_velocity_in_base(robot, truth).to_array());
-        let feet = robot.truth.map(|truth| foot_states(&self.feet, robot, truth));
-        if let Some(truth) = robot.truth {
-            state.contacts.update(&truth.foot_force[index], policy_dt);
-        }
+        let truth = robot.truth.as_ref();
+        let velocity = truth.map(|truth| linear_velocity_in_base(robot, truth).to_array());
         RewardInput {
-            policy_dt,
+            policy_dt: self.spec.policy_dt as f32,
             tracking_sigma: self.config.tracking_sigma,
             command: state.command,
             linear_velocity: velocity.unwrap_or_default(),
-            angular_velocity: measured.gyro[index],
-            gravity: frames::projected_gravity(measured.orientation[index]).to_array(),
-            q: &measured.q[index],
-            dq: &measured.dq[index],
+            angular_velocity: robot.gyro,
+            gravity: frames::projected_gravity(robot.orientation).to_array(),
+            q: robot.q,
+            dq: robot.dq,
             previous_dq: step.previous_dq,
-            tau: &measured.tau[index],
+            tau: robot.tau,
+            torque_scale: self.torque_scale,
             action: step.action,
             previous_action: step.previous_action,
             default_pose: &self.default_pose,
-            soft_lower: &self.soft_lower,
-            soft_upper: &self.soft_upper,
+            soft_lower: &self.soft_limits[0],
+            soft_upper: &self.soft_limits[1],
+            hips: &self.robot.hips,
             touchdown_air_time: state.contacts.touchdown_air_time(),
             target_air_time: self.config.target_air_time_s,
             foot_contact: state.contacts.on_ground(),
-            foot_height: feet.map_or([0.0; 4], |feet| feet.map(|foot| foot.height)),
-            foot_speed: feet.map_or([0.0; 4], |feet| feet.map(|foot| foot.horizontal_speed)),
+            feet,
             target_foot_height: self.config.target_foot_height_m,
-            base_height: of_truth(base_height),
-            target_base_height: self.config.target_base_height_m,
+            base_height: truth.map_or(0.0, |truth| base_height(robot, truth)),
+            target_base_height: self.target_base_height,
             is_terminated,
-            body_contact: robot.truth.is_some_and(|truth| truth.body_contact[index]),
-            uncertainty: of_truth(|robot, truth| truth.epistemic_uncertainty[robot.index]),
+            body_contact: truth.is_some_and(|truth| truth.body_contact),
+            uncertainty: truth.map_or(0.0, |truth| truth.epistemic_uncertainty),
         }
     }
+}
+
+/// Returns lower and upper limits of the central part of each joint's range.
+fn soft_limits(robot: &ControlledRobot) -> [Vec<f32>; 2] {
+    let limits = robot.ranges.iter().map(|[low, high]| [*low as f32, *high as f32]);
+    let soft = limits.map(|[low, high]| {
+        let margin = (1.0 - SOFT_JOINT_LIMIT_FACTOR) / 2.0 * (high - low);
+        // A joint without limits has none within them.
+        let margin = if margin.is_finite() { margin } else { 0.0 };
+        (low + margin, high - margin)
+    });
+    let (lower, upper) = soft.unzip();
+    [lower, upper]
 }
 
 impl Task for Walk {
@@ -131,31 +161,36 @@ impl Task for Walk {
         &self.spec
     }
 
-    fn start(&self, random: &mut Stream) -> (PerJoint, WalkState) {
+    fn start(&self, random: &mut Stream) -> (Vec<f32>, WalkState) {
         let noise = self.config.reset_joint_noise_rad;
-        let q = self.default_pose.map(|position| position + (2.0 * noise * random.random::<f32>() - noise));
+        let pose = self.default_pose.iter();
+        let q = pose.map(|position| position + (2.0 * noise * random.random::<f32>() - noise)).collect();
         let command = self.draw_command(random);
         // The first command is shorter, so that robots that start together do not change their commands together.
         let steps_to_command = Some(random.random_range(1..=self.resample_steps));
         (q, WalkState { command, steps_to_command, contacts: FootContacts::default() })
     }
 
-    fn observe(&self, state: &WalkState, robot: &RobotView, action: &PerJoint, obs: &mut [f32]) {
+    fn observe(&self, state: &WalkState, robot: &RobotView, action: &[f32], obs: &mut [f32]) {
         observe(robot, state.command, &self.default_pose, action, obs);
     }
 
     fn observe_critic(&self, _state: &WalkState, robot: &RobotView, obs: &mut [f32]) {
-        if let Some(truth) = robot.truth {
+        if let Some(truth) = &robot.truth {
             observe_privileged(robot, truth, obs);
         }
     }
 
     fn evaluate(&self, state: &mut WalkState, step: &Step, random: &mut Stream, terms: &mut [f32]) -> bool {
-        let gravity = frames::projected_gravity(step.robot.measured.orientation[step.robot.index]);
-        let is_too_low =
-            step.robot.truth.is_some_and(|truth| base_height(&step.robot, truth) < self.config.min_base_height_m);
+        let robot = &step.robot;
+        let gravity = frames::projected_gravity(robot.orientation);
+        let is_too_low = robot.truth.is_some_and(|truth| base_height(robot, &truth) < self.min_base_height);
         let is_terminated = is_too_low || -gravity.z < self.cos_max_tilt;
-        let values = self.config.reward.evaluate(&self.reward_input(state, step, is_terminated));
+        let feet = robot.truth.map_or_else(Vec::new, |truth| {
+            state.contacts.update(truth.foot_force, self.spec.policy_dt as f32);
+            foot_states(&self.robot.feet, robot, &truth)
+        });
+        let values = self.config.reward.evaluate(&self.reward_input(state, step, &feet, is_terminated));
         for (term, index) in terms.iter_mut().zip(&self.terms) {
             *term = values[*index];
         }
@@ -209,7 +244,7 @@ mod tests {
         let (ground, action, mut random) = (Ground::FLAT, [0.0; 12], stream(0, "test", 0));
         let ends = |task: &Walk, truth: bool, random: &mut Stream| {
             let truth = truth.then_some(&states.truth);
-            let robot = RobotView { measured: &states.measured, truth, ground: &ground, index: 0 };
+            let robot = RobotView::of(&states.measured, truth, &ground, 0);
             let step = Step { robot, action: &action, previous_action: &action, previous_dq: &action, length: 1 };
             let mut terms = vec![f32::NAN; task.spec().reward_terms.len()];
             let ended = task.evaluate(&mut task.start(random).1, &step, random, &mut terms);

@@ -1,9 +1,16 @@
 //! Settings of the task `walk`: velocity commands, weights of the reward terms, end of an episode.
 
 use serde::{Deserialize, Serialize};
+use twinstep_model::go2;
 
+use crate::ControlledRobot;
 use crate::config::{ConfigError, Range, check_range, check_value};
 use crate::reward::{self as terms, reward_weights};
+
+/// Height of the base of a walking Go2 [m].
+const GO2_BASE_HEIGHT: f64 = 0.30;
+/// Height of the base below which a Go2 has fallen [m].
+const GO2_MIN_HEIGHT: f64 = 0.15;
 
 /// The `[task]` table of `walk`: velocity commands, rewards, termination.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -21,16 +28,19 @@ pub struct WalkConfig {
     pub reward: RewardWeights,
     /// Width σ of the tracking rewards `exp(−error² / σ)` [m²/s², rad²/s²].
     pub tracking_sigma: f32,
-    /// Height of the base above the ground for the term `base_height` [m].
-    pub target_base_height_m: f32,
+    /// Height of the base above the ground for the term `base_height` [m]. Default: 0.3 m for the Go2; others by their standing height.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub target_base_height_m: Option<f32>,
     /// Height of a swinging foot's centre above the ground for the term `feet_clearance` [m].
     pub target_foot_height_m: f32,
     /// Duration of a swing phase above which `feet_air_time` is positive [s].
     pub target_air_time_s: f32,
     /// Tilt of the base above which the episode terminates [rad].
     pub max_tilt_rad: f32,
-    /// Height of the base above the ground under it, below which the episode terminates [m].
-    pub min_base_height_m: f32,
+    /// Height of the base above the ground under it, below which the episode terminates [m]. Default: 0.15 m for the Go2; others by
+    /// their standing height.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub min_base_height_m: Option<f32>,
     /// Maximum initial offset of each joint from the default pose [rad].
     pub reset_joint_noise_rad: f32,
 }
@@ -44,11 +54,11 @@ impl Default for WalkConfig {
             command: CommandRanges::default(),
             reward: RewardWeights::default(),
             tracking_sigma: 0.25,
-            target_base_height_m: 0.30,
+            target_base_height_m: None,
             target_foot_height_m: 0.11,
             target_air_time_s: 0.1,
             max_tilt_rad: 1.0,
-            min_base_height_m: 0.15,
+            min_base_height_m: None,
             reset_joint_noise_rad: 0.1,
         }
     }
@@ -65,15 +75,40 @@ impl WalkConfig {
         check_value("task.command_resample_s", self.command_resample_s, 0.02, 1e6)?;
         check_value("task.tracking_sigma", self.tracking_sigma, 1e-6, 1e6)?;
         check_value("task.standing_probability", self.standing_probability, 0.0, 1.0)?;
-        check_value("task.target_base_height_m", self.target_base_height_m, 0.0, 1.0)?;
+        if let Some(height) = self.target_base_height_m {
+            check_value("task.target_base_height_m", height, 0.0, 10.0)?;
+        }
         check_value("task.target_foot_height_m", self.target_foot_height_m, 0.0, 1.0)?;
         check_value("task.target_air_time_s", self.target_air_time_s, 0.0, 10.0)?;
         check_value("task.max_tilt_rad", self.max_tilt_rad, 0.0, 3.2)?;
-        check_value("task.min_base_height_m", self.min_base_height_m, -1e6, 1.0)?;
+        if let Some(height) = self.min_base_height_m {
+            check_value("task.min_base_height_m", height, -1e6, 10.0)?;
+        }
         check_value("task.reset_joint_noise_rad", self.reset_joint_noise_rad, 0.0, 1.0)?;
         self.reward
             .values()
             .try_for_each(|(name, weight)| check_value(&format!("task.reward.{name}"), weight, -1e6, 1e6))
+    }
+
+    /// Returns the heights of the base without a penalty, and below which the episode terminates [m].
+    pub(crate) fn heights(&self, robot: &ControlledRobot) -> Result<[f32; 2], ConfigError> {
+        let missing = |value: &str, allowed: &str| {
+            let [field, value, allowed] = ["task.name", value, allowed].map(str::to_owned);
+            ConfigError { field, value, allowed }
+        };
+        let Some(standing) = robot.standing_height else {
+            return Err(missing("walk", "`pose` for a robot whose base is fixed"));
+        };
+        if robot.feet.len() < 2 {
+            let allowed = "`pose` for a robot without feet; name the links on which it stands in `[groups] foot` of the model file";
+            return Err(missing("walk", allowed));
+        }
+        let go2 = ControlledRobot::from(&go2()).standing_height.expect("a quadruped stands");
+        let by_size = |height: f64| (height * (standing / go2)) as f32;
+        Ok([
+            self.target_base_height_m.unwrap_or_else(|| by_size(GO2_BASE_HEIGHT)),
+            self.min_base_height_m.unwrap_or_else(|| by_size(GO2_MIN_HEIGHT)),
+        ])
     }
 }
 

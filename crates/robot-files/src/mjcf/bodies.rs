@@ -1,8 +1,10 @@
 //! Bodies and frames of MJCF files, from one body outwards.
 
+use std::collections::BTreeSet;
+
 use glam::{DAffine3, DMat3, DVec3};
 use roxmltree::Node;
-use twinstep_model::{BaseMount, RigidBody, TreeShapeKind};
+use twinstep_model::{BaseMount, FreeJoint, RigidBody, TreeShapeKind};
 
 use super::actuators::Actuators;
 use super::compiler::{MassSource, Settings};
@@ -31,6 +33,8 @@ pub struct Reader<'a, 'b> {
     pub actuators: &'b Actuators,
     /// Meshes by name.
     pub meshes: &'b Meshes<'b>,
+    /// Shapes that touch the ground whatever their contact bits.
+    pub paired: &'b BTreeSet<String>,
     /// What was read so far.
     pub tree: TreeBuilder,
 }
@@ -59,6 +63,11 @@ pub fn joints_of<'a>(body: Node<'a, 'a>) -> Vec<Node<'a, 'a>> {
     joints
 }
 
+/// Returns true if a body or one below it has a joint.
+pub fn moves(body: Node) -> bool {
+    body.descendants().any(|node| node.has_tag_name("joint") || node.has_tag_name("freejoint"))
+}
+
 /// Returns the free joint of a body.
 pub fn free_joint<'a>(body: Node<'a, 'a>) -> Option<Node<'a, 'a>> {
     joints_of(body).into_iter().find(|joint| joint.has_tag_name("freejoint") || joint.attribute("type") == Some("free"))
@@ -78,7 +87,7 @@ impl<'a> Reader<'a, '_> {
         let class = robot.node.attribute("childclass").unwrap_or(robot.class);
         self.check_body(robot.node)?;
         if let Some(joint) = free_joint(robot.node) {
-            self.check_free_joint(joint, class)?;
+            self.tree.set_free_joint(self.free_joint(joint, class)?);
         }
         self.fill(Place { node: robot.node, pose: DAffine3::IDENTITY, class }, 0)
     }
@@ -90,20 +99,23 @@ impl<'a> Reader<'a, '_> {
         body.check_value("mocap", &["false"])
     }
 
-    /// Refuses a free joint with forces of its own, and one that turns the frame of its body.
-    fn check_free_joint(&self, node: Node<'a, 'a>, class: &str) -> Result<(), RobotFileError> {
+    /// Reads what a free joint inherits or states, and refuses one that turns the frame of its body.
+    fn free_joint(&self, node: Node<'a, 'a>, class: &str) -> Result<FreeJoint, RobotFileError> {
         if node.has_tag_name("freejoint") {
             let joint = Element { node, kind: "freejoint", class: &self.classes["main"] };
             joint.check(&[&["name", "group", "user", "align"]])?;
-            return joint.check_value("align", &["auto", "false"]);
+            joint.check_value("align", &["auto", "false"])?;
+            return Ok(FreeJoint::default());
         }
         let joint = Element::new(node, "joint", class, self.classes)?;
-        for name in ["armature", "damping", "frictionloss", "stiffness"] {
-            if joint.number(name, 0.0)? != 0.0 {
-                return Err(unsupported(node, format!("`{name}` of a free joint is not supported: use <freejoint/>")));
-            }
+        if joint.number("stiffness", 0.0)? != 0.0 {
+            return Err(unsupported(node, "`stiffness` of a free joint is not supported: use <freejoint/>"));
         }
-        Ok(())
+        let value = |name: &str| match joint.number(name, 0.0)? {
+            value if value >= 0.0 => Ok(value),
+            value => Err(unsupported(node, format!("`{name}` of a free joint is {value}; 0 or more expected"))),
+        };
+        Ok(FreeJoint { armature: value("armature")?, damping: value("damping")?, friction: value("frictionloss")? })
     }
 
     /// Returns the bodies directly in a body or the world, also those in frames.
@@ -225,7 +237,8 @@ impl<'a> Reader<'a, '_> {
         if weighs && let Some(body) = geom.body(node, self.settings)? {
             self.tree.add_mass(index, place.pose, body);
         }
-        if geom.collides {
+        let is_paired = geom.name.as_ref().is_some_and(|name| self.paired.contains(name));
+        if geom.collides || is_paired {
             let name = geom.name.as_deref().unwrap_or_else(|| place.node.attribute("name").unwrap_or("geom"));
             let kind = match (geom.kind, element.attribute("mesh")) {
                 // Only a mesh as it is has the bounds of its file.

@@ -2,7 +2,8 @@
 //!
 //! - [`defaults`]: default classes; [`element`]: an element with its class.
 //! - [`compiler`]: the settings of `<compiler>`.
-//! - [`worldbody`]: finds the robot; [`bodies`]: descends from its base through bodies and frames. [`joints`], [`geoms`], [`meshes`], [`actuators`]: what is in them.
+//! - [`worldbody`]: finds the robot; [`bodies`]: descends from its base through bodies and frames. [`joints`], [`geoms`], [`meshes`], [`actuators`],
+//!   [`pairs`]: what is in them.
 
 mod actuators;
 mod bodies;
@@ -12,6 +13,7 @@ mod element;
 mod geoms;
 mod joints;
 mod meshes;
+mod pairs;
 mod worldbody;
 
 use std::path::Path;
@@ -46,7 +48,8 @@ pub fn read<'a>(root: Node<'a, 'a>, folder: Option<&Path>) -> Result<RobotFile, 
     let classes = defaults::read(root)?;
     let actuators = actuators::Actuators::read(root, &classes)?;
     let meshes = meshes::Meshes::read(root, folder)?;
-    worldbody::read(root, &settings, &classes, &actuators, &meshes)
+    let pairs = pairs::Pairs::read(root)?;
+    worldbody::read(root, &settings, &classes, &actuators, &meshes, &pairs)
 }
 
 /// Refuses sections that add forces or constraints, by the name of the first element.
@@ -59,7 +62,8 @@ fn check_sections(root: Node) -> Result<(), RobotFileError> {
         // Robots have no contacts with themselves, so only the ground is not to be excluded.
         let is_needless = |part: &Node| {
             let bodies = [part.attribute("body1"), part.attribute("body2")];
-            part.has_tag_name("exclude") && !bodies.contains(&Some("world"))
+            let keeps_ground = part.has_tag_name("exclude") && !bodies.contains(&Some("world"));
+            keeps_ground || name == "contact" && part.has_tag_name("pair")
         };
         let mut parts = section.children().filter(Node::is_element).filter(|part| !is_needless(part));
         match parts.next() {

@@ -5,10 +5,11 @@ use roxmltree::Node;
 use twinstep_model::BaseMount;
 
 use super::actuators::Actuators;
-use super::bodies::{Place, Reader, free_joint, joints_of, label};
+use super::bodies::{Place, Reader, free_joint, joints_of, label, moves};
 use super::compiler::Settings;
 use super::defaults::Classes;
 use super::meshes::Meshes;
+use super::pairs::Pairs;
 use crate::tree_builder::TreeBuilder;
 use crate::xml::{child, unsupported};
 use crate::{RobotFile, RobotFileError};
@@ -23,6 +24,7 @@ pub fn read<'a>(
     classes: &Classes<'a>,
     actuators: &Actuators,
     meshes: &Meshes,
+    pairs: &Pairs,
 ) -> Result<RobotFile, RobotFileError> {
     let name = root.attribute("model").unwrap_or("robot");
     let world = child(root, "worldbody").ok_or_else(|| unsupported(root, "<mujoco> has no <worldbody>"))?;
@@ -31,9 +33,11 @@ pub fn read<'a>(
     }
     let place = Place { node: world, pose: DAffine3::IDENTITY, class: "main" };
     let tree = TreeBuilder::new(name, "world", None, DAffine3::IDENTITY);
-    let mut reader = Reader { settings, classes, actuators, meshes, tree };
+    let paired = &pairs.with_ground;
+    let mut reader = Reader { settings, classes, actuators, meshes, paired, tree };
     let all = reader.bodies_of(place)?;
-    let (robots, furniture): (Vec<Place>, Vec<Place>) = all.into_iter().partition(|place| moves(place.node));
+    let (moving, furniture): (Vec<Place>, Vec<Place>) = all.into_iter().partition(|place| moves(place.node));
+    let (robots, objects) = without_objects(moving, actuators);
     let free: Vec<&Place> = robots.iter().filter(|place| free_joint(place.node).is_some()).collect();
     match (&robots[..], &free[..]) {
         ([], _) => return Err(unsupported(world, "<worldbody> has no body with a joint")),
@@ -58,6 +62,12 @@ pub fn read<'a>(
             }
         }
     }
+    for place in objects {
+        reader.tree.note(format!("body `{}` has no actuator and is not part of the robot", label(place.node)));
+    }
+    if pairs.has_own {
+        reader.tree.note("contacts between shapes of the robot are left out");
+    }
     for place in furniture {
         reader.tree.note(format!("body `{}` never moves and is not part of the robot", label(place.node)));
     }
@@ -76,7 +86,18 @@ pub fn read<'a>(
     reader.tree.finish()
 }
 
-/// Returns true if a body or one below it has a joint.
-fn moves(body: Node) -> bool {
-    body.descendants().any(|node| node.has_tag_name("joint") || node.has_tag_name("freejoint"))
+/// Returns the bodies that may be the robot, and those that stand or lie beside a robot and that nothing drives.
+///
+/// They matter only where one body moves freely: bodies that are all fixed to the world are one tree.
+fn without_objects<'a>(moving: Vec<Place<'a>>, actuators: &Actuators) -> (Vec<Place<'a>>, Vec<Place<'a>>) {
+    let is_free = |place: &Place| free_joint(place.node).is_some();
+    let is_driven = |place: &Place| {
+        let names = place.node.descendants().filter(|node| node.has_tag_name("joint"));
+        let names: Vec<_> = names.filter_map(|joint| joint.attribute("name")).collect();
+        actuators.joints().any(|joint| names.contains(&joint))
+    };
+    if moving.len() < 2 || !moving.iter().any(is_free) || !moving.iter().any(is_driven) {
+        return (moving, Vec::new());
+    }
+    moving.into_iter().partition(is_driven)
 }

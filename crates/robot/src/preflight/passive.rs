@@ -1,7 +1,7 @@
 //! What is wrong without moving the robot.
 
 use glam::Vec3;
-use twinstep_model::{FootKinematics, Joint, JointKind, Leg, PerJoint, RobotModel, frames};
+use twinstep_model::{Feet, Joint, JointKind, Leg, PerJoint, RobotModel, frames};
 use twinstep_unitree::LowState;
 
 use super::finding::{Blocks, Finding};
@@ -189,7 +189,7 @@ impl Observation {
     /// Feet far above their hips: a thigh or calf with the wrong sign or zero.
     fn feet(&self, robot: &RobotModel) -> Vec<Finding> {
         let q = joint_mean(&self.samples, |sample| sample.q);
-        let feet = FootKinematics::new(robot).feet(&q, &[0.0; 12]);
+        let feet = Feet::from(robot).motions(&q, &[0.0; 12]).collect::<Vec<_>>();
         let high = Leg::ALL.into_iter().filter(|leg| feet[*leg as usize].position.z > MAX_FOOT_ABOVE_HIP);
         high.map(|leg| {
             let thigh = Joint { leg, kind: JointKind::Thigh };

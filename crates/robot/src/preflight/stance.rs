@@ -3,7 +3,7 @@
 use std::f32::consts::TAU;
 
 use glam::{Mat3, Quat, Vec3};
-use twinstep_model::{FootKinematics, Joint, JointKind, Leg, PerJoint, RobotModel, frames};
+use twinstep_model::{Feet, Joint, JointKind, Leg, PerJoint, RobotModel, frames};
 
 use super::finding::{Blocks, Finding, LeftOut};
 use super::joint_test::JointTest;
@@ -264,8 +264,8 @@ fn frame_readings() -> Vec<FrameReading> {
 }
 
 /// Returns the direction up in the base frame that follows from the joint positions, if all feet are on level ground.
-fn up_of_feet(kinematics: &FootKinematics, q: &PerJoint) -> Vec3 {
-    let feet = kinematics.feet(q, &[0.0; 12]).map(|foot| foot.position);
+fn up_of_feet(kinematics: &Feet, q: &PerJoint) -> Vec3 {
+    let feet = kinematics.motions(q, &[0.0; 12]).map(|foot| foot.position).collect::<Vec<_>>();
     let centre = feet.iter().sum::<Vec3>() / 4.0;
     // Diagonals of the quadrangle span the plane nearest to four points.
     let (first, second) =
@@ -276,7 +276,7 @@ fn up_of_feet(kinematics: &FootKinematics, q: &PerJoint) -> Vec3 {
 }
 
 /// Returns the share of the measured motion of the trunk that the feet do not explain, and their constant difference.
-fn unexplained(samples: &[Sample], kinematics: &FootKinematics, reading: Option<&FrameReading>) -> (f32, Vec3) {
+fn unexplained(samples: &[Sample], kinematics: &Feet, reading: Option<&FrameReading>) -> (f32, Vec3) {
     let turn = reading.map_or(Mat3::IDENTITY, |reading| reading.base_from_sensor);
     let measured = |sample: &Sample| turn * sample.up();
     let joints = |q: PerJoint| reading.map_or(q, |reading| (reading.joints)(q));
@@ -287,7 +287,7 @@ fn unexplained(samples: &[Sample], kinematics: &FootKinematics, reading: Option<
 
 /// Compares the trunk's motion with that of the feet, and names the change that makes them agree.
 fn frame_finding(samples: &[Sample], robot: &RobotModel) -> Option<Finding> {
-    let kinematics = FootKinematics::new(robot);
+    let kinematics = Feet::from(robot);
     let (found, offset) = unexplained(samples, &kinematics, None);
     // No other mistake turns the plane of the feet on average: the legs pass through the same poses on all sides.
     if offset.length() > MAX_PLANE_ANGLE {
@@ -318,7 +318,7 @@ fn frame_finding(samples: &[Sample], robot: &RobotModel) -> Option<Finding> {
 }
 
 /// Names the joint whose zero explains a constant angle between the plane of the feet and the horizontal.
-fn offset_finding(samples: &[Sample], kinematics: &FootKinematics, offset: Vec3) -> Option<Finding> {
+fn offset_finding(samples: &[Sample], kinematics: &Feet, offset: Vec3) -> Option<Finding> {
     let left = |joint: Joint, angle: f32| {
         let difference = |sample: &Sample| {
             let mut q = sample.q;

@@ -27,6 +27,8 @@ pub trait BatchRobot: Sync {
     fn contact(&self) -> &Contact;
     /// Returns true if the base cannot move, however the simulation mounts it.
     fn is_fixed(&self) -> bool;
+    /// Returns the dry friction of a free base [N and N·m].
+    fn base_friction(&self) -> f64;
     /// Returns the reading of the gyroscope at rest [rad/s].
     fn gyro_bias(&self) -> DVec3;
     /// Returns the points that touch the ground. Those of a body follow each other.
@@ -44,6 +46,10 @@ impl BatchRobot for RobotModel {
 
     fn is_fixed(&self) -> bool {
         false
+    }
+
+    fn base_friction(&self) -> f64 {
+        0.0
     }
 
     fn gyro_bias(&self) -> DVec3 {
@@ -87,6 +93,10 @@ impl BatchRobot for TreeModel {
 
     fn is_fixed(&self) -> bool {
         self.tree.base == Some(BaseMount::Fixed)
+    }
+
+    fn base_friction(&self) -> f64 {
+        self.tree.free_joint.friction
     }
 
     fn gyro_bias(&self) -> DVec3 {

@@ -5,11 +5,11 @@
 //! and d the impedance. b and k follow from the time constant at critical damping. Joint friction is a hard constraint:
 //! it stops the joint unless its maximum torque is reached.
 
-use twinstep_dynamics::{JointValues, State, StepEquations};
+use twinstep_dynamics::{JointValues, State, StepEquations, Vec3};
 use twinstep_simd::SimdFloat;
 
 use super::ground::{LocalTerrain, TangentPlane};
-use super::rows::{ConstraintRow, PointRow, SoftConstraint, complete_friction, write_joint_row};
+use super::rows::{ConstraintRow, PointRow, SoftConstraint, complete_friction, write_base_row, write_joint_row};
 use super::surface::{ContactParams, PointsOfBody, SimdPoint};
 
 /// Number of points of a body from which on it is worth while to test first whether all are far from the ground.
@@ -24,19 +24,26 @@ pub struct Impulses<T> {
     pub limits: Vec<[T; 2]>,
     /// Impulse of the friction of each joint [N·m·s or N·s].
     pub frictions: Vec<T>,
+    /// Impulse of the friction of a free base [N·s and N·m·s].
+    pub base_frictions: [T; 6],
 }
 
 impl<T: SimdFloat> Impulses<T> {
     /// Creates impulses of zero.
     pub fn zero(points: usize, joints: usize) -> Self {
         let zero = T::splat(0.0);
-        Self { points: vec![[zero; 3]; points], limits: vec![[zero; 2]; joints], frictions: vec![zero; joints] }
+        Self {
+            points: vec![[zero; 3]; points],
+            limits: vec![[zero; 2]; joints],
+            frictions: vec![zero; joints],
+            base_frictions: [zero; 6],
+        }
     }
 
     /// Returns all impulses, always in the same order.
     pub fn all_mut(&mut self) -> impl Iterator<Item = &mut T> {
-        let Self { points, limits, frictions } = self;
-        points.iter_mut().flatten().chain(limits.iter_mut().flatten()).chain(frictions)
+        let Self { points, limits, frictions, base_frictions } = self;
+        points.iter_mut().flatten().chain(limits.iter_mut().flatten()).chain(frictions).chain(base_frictions)
     }
 }
 
@@ -72,6 +79,9 @@ pub struct Constraints<T, B> {
     /// Two for each joint: at the lower and at the upper limit.
     limits: Vec<JointBlock<T, B>>,
     frictions: Vec<JointBlock<T, B>>,
+    /// Of a free base: three about the axes of the base, three along those of the world.
+    base_frictions: [ConstraintRow<T, B>; 6],
+    has_base_friction: bool,
     active_points: Vec<usize>,
     active_limits: Vec<usize>,
     active_frictions: Vec<usize>,
@@ -94,6 +104,8 @@ impl<T: SimdFloat, B: JointValues<T>> Constraints<T, B> {
             points: bodies.iter().map(point).collect(),
             limits: (0..2 * num_joints).map(|index| joint(index / 2)).collect(),
             frictions: (0..num_joints).map(joint).collect(),
+            base_frictions: std::array::from_fn(|_| row(0)),
+            has_base_friction: false,
             active_points: Vec::with_capacity(bodies.len()),
             active_limits: Vec::with_capacity(2 * num_joints),
             active_frictions: Vec::with_capacity(num_joints),
@@ -114,6 +126,10 @@ impl<T: SimdFloat, B: JointValues<T>> Constraints<T, B> {
         self.active_limits.clear();
         self.active_frictions.clear();
         self.detect_contacts(step, impulses);
+        self.has_base_friction = T::splat(0.0).any_lt(step.surface.base_friction);
+        if self.has_base_friction {
+            self.write_base_friction(step);
+        }
         for joint in 0..dry_friction.as_ref().len() {
             self.find_limits(step, impulses, joint);
             if T::splat(0.0).any_lt(dry_friction[joint]) {
@@ -124,6 +140,23 @@ impl<T: SimdFloat, B: JointValues<T>> Constraints<T, B> {
             } else {
                 impulses.frictions[joint] = T::splat(0.0);
             }
+        }
+    }
+
+    fn write_base_friction<E: StepEquations<T, Branch = B>>(&mut self, step: &Step<'_, T, E>) {
+        let (state, zero, one) = (step.state, T::splat(0.0), T::splat(1.0));
+        let world = state.world_axes();
+        for (index, row) in self.base_frictions.iter_mut().enumerate() {
+            let axis = index % 3;
+            let (direction, velocity) = if index < 3 {
+                let mut turn = [zero; 3];
+                turn[axis] = one;
+                ([Vec3(turn), Vec3::zero()], state.angular_velocity.0[axis])
+            } else {
+                ([Vec3::zero(), world[axis]], state.linear_velocity.0[axis])
+            };
+            write_base_row(step.equations, row, direction);
+            complete_friction(row, velocity);
         }
     }
 
@@ -232,6 +265,11 @@ impl<T: SimdFloat, B: JointValues<T>> Constraints<T, B> {
             let JointBlock { row, body } = &self.frictions[*joint];
             row.apply_impulse(equations, *body, impulses.frictions[*joint]);
         }
+        if self.has_base_friction {
+            for (row, impulse) in self.base_frictions.iter().zip(&impulses.base_frictions) {
+                row.apply_impulse(equations, 0, *impulse);
+            }
+        }
         for _ in 0..iterations {
             for index in &self.active_points {
                 solve_point(equations, &self.points[*index], &mut impulses.points[*index], surface.friction);
@@ -245,17 +283,33 @@ impl<T: SimdFloat, B: JointValues<T>> Constraints<T, B> {
             }
             for joint in &self.active_frictions {
                 let (JointBlock { row, body }, impulse) = (&self.frictions[*joint], &mut impulses.frictions[*joint]);
-                let max_impulse = dry[*joint] * dt;
-                let new = (*impulse - row.impulse_error(equations, *body, *impulse)).max(-max_impulse).min(max_impulse);
-                // A sliding joint has reached its maximum, so that nothing changes.
-                let change = new - *impulse;
-                if T::splat(0.0).any_lt(change.abs()) {
-                    row.apply_impulse(equations, *body, change);
+                solve_friction(equations, row, *body, impulse, dry[*joint] * dt);
+            }
+            if self.has_base_friction {
+                for (row, impulse) in self.base_frictions.iter().zip(&mut impulses.base_frictions) {
+                    solve_friction(equations, row, 0, impulse, surface.base_friction * dt);
                 }
-                *impulse = new;
             }
         }
     }
+}
+
+/// Solves a row of dry friction, whose impulse is at most `largest`.
+#[inline(always)]
+fn solve_friction<T: SimdFloat, E: StepEquations<T>>(
+    equations: &mut E,
+    row: &ConstraintRow<T, E::Branch>,
+    body: usize,
+    impulse: &mut T,
+    largest: T,
+) {
+    let new = (*impulse - row.impulse_error(equations, body, *impulse)).max(-largest).min(largest);
+    // What slides has reached its maximum, so that nothing changes.
+    let change = new - *impulse;
+    if T::splat(0.0).any_lt(change.abs()) {
+        row.apply_impulse(equations, body, change);
+    }
+    *impulse = new;
 }
 
 /// Solves the three rows of a contact point: the normal impulse, then both friction impulses.

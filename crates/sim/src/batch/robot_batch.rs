@@ -131,6 +131,7 @@ impl<T: SimdFloat, E: StepEquations<T, Robot: BatchRobot>> RobotBatch<T, E> {
         }
         self.gyro_bias.set(lane, robot.gyro_bias());
         self.surface.friction.set(lane, robot.contact().friction);
+        self.surface.base_friction.set(lane, robot.base_friction() * self.surface.is_floating.get(lane));
         // At least two steps, below which the constraint is unstable (MuJoCo's `refsafe`).
         self.surface.time_constant.set(lane, robot.contact().time_constant.max(2.0 * self.dt.get(lane)));
 
@@ -341,6 +342,7 @@ impl<T: SimdFloat, E: StepEquations<T, Robot: BatchRobot>> RobotBatch<T, E> {
         gyro_bias.0.iter_mut().for_each(&mut visit);
         actuator.visit(&mut visit);
         visit(&mut surface.friction);
+        visit(&mut surface.base_friction);
         visit(&mut surface.time_constant);
         let State { position, orientation, linear_velocity, angular_velocity, q, dq } = state;
         position.0.iter_mut().chain(orientation).chain(&mut linear_velocity.0).for_each(&mut visit);

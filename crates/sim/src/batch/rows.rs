@@ -174,6 +174,18 @@ pub fn write_joint_row<T: SimdFloat, E: StepEquations<T>>(
     body
 }
 
+/// Writes the row of a velocity of a free base, `direction` of its angular velocity, then of its linear one in base axes.
+#[inline(always)]
+pub fn write_base_row<T: SimdFloat, E: StepEquations<T>>(
+    equations: &E,
+    row: &mut ConstraintRow<T, E::Branch>,
+    [angular, linear]: [Vec3<T>; 2],
+) {
+    let ([a, b, c], [d, e, f]) = (angular.0, linear.0);
+    row.branch.as_mut().fill(T::splat(0.0));
+    whiten(equations, row, 0, [a, b, c, d, e, f], T::splat(1.0));
+}
+
 /// Completes the row of dry friction, whose target velocity is zero.
 #[inline(always)]
 pub fn complete_friction<T: SimdFloat, B: JointValues<T>>(row: &mut ConstraintRow<T, B>, velocity: T) {

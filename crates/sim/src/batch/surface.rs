@@ -26,6 +26,8 @@ pub struct ContactParams<T> {
     pub limits: Vec<[T; 2]>,
     /// Time constant of a joint limit [s]; at least two steps.
     pub limit_time_constant: T,
+    /// Dry friction of a free base [N and N·m].
+    pub base_friction: T,
     /// 1 with a free base, 0 with a fixed base.
     pub is_floating: T,
 }
@@ -91,6 +93,7 @@ impl<T: SimdFloat> ContactParams<T> {
             friction: zero,
             time_constant: zero,
             limits: robot.joints().iter().map(|joint| joint.range.map(T::splat)).collect(),
+            base_friction: zero,
             limit_time_constant: T::splat(2.0 * dt),
             is_floating: T::splat(if config.base.is_fixed() || robot.is_fixed() { 0.0 } else { 1.0 }),
         }

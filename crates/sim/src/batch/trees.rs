@@ -11,6 +11,7 @@ use super::simulator::{SimdPrecision, advance};
 use super::workspace::{Workspace, WorkspaceShape};
 use crate::actuator_input::ActuatorInput;
 use crate::tree_engine::{TreeCommand, TreeEngine, TreeReadings};
+use crate::tree_error::TreeError;
 use crate::{Placement, SimConfig};
 
 /// Creates robots of any tree in a state.
@@ -61,8 +62,14 @@ struct Trees<T: SimdFloat> {
 }
 
 impl<T: SimdFloat> TreeEngine for Trees<T> {
-    fn place(&mut self, robot: usize, model: &TreeModel, state: &Placement) {
+    fn place(&mut self, robot: usize, model: &TreeModel, state: &Placement) -> Result<(), TreeError> {
         self.batches[robot / T::LANES].place(robot % T::LANES, model, state);
+        Ok(())
+    }
+
+    fn push(&mut self, robot: usize, velocity: [f32; 3]) -> Result<(), TreeError> {
+        self.batches[robot / T::LANES].push(robot % T::LANES, velocity);
+        Ok(())
     }
 
     fn read(&self, robot: usize, readings: &mut TreeReadings) {
@@ -76,7 +83,7 @@ impl<T: SimdFloat> TreeEngine for Trees<T> {
         [actuator_periods, steps]: [usize; 2],
         states: &mut [TreeReadings],
         parallel: bool,
-    ) {
+    ) -> Result<(), TreeError> {
         let count = StepCount { actuator_periods, steps };
         let Self { batches, shape, shapes } = self;
         let one = |workspace: &mut Workspace<T, TreeEquations<T>>, (batch, (commands, states)): Robots<'_, T>| {
@@ -97,6 +104,7 @@ impl<T: SimdFloat> TreeEngine for Trees<T> {
             let robots = commands.chunks(T::LANES).zip(states.chunks_mut(T::LANES));
             batches.iter_mut().zip(robots).for_each(|robots| one(&mut workspace, robots));
         }
+        Ok(())
     }
 }
 

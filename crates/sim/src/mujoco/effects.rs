@@ -1,14 +1,14 @@
 //! Effects of a robot model that MuJoCo simulates, and those that it does not.
 
-use twinstep_model::{ActuatorParams, Command, InitialState, PerJoint, RobotModel};
+use twinstep_model::{ActuatorParams, Command, InitialState, JointModel, PerJoint, RobotModel};
 
-/// Returns the name of an effect of `robot` that MuJoCo does not simulate. Returns `None` if it simulates all.
+/// Returns the name of an effect of joints that MuJoCo does not simulate. Returns `None` if it simulates all.
 ///
 /// Its model (MJCF) has bodies, armature, viscous and Coulomb friction, springs, torque gains and the ground. Gains of the
 /// PD loop, offsets of the sensors and derating are added by [`Adjustments`], delays of commands by
 /// [`CommandDelay`](super::delay::CommandDelay).
-pub fn unsupported(robot: &RobotModel) -> Option<&'static str> {
-    robot.joints.iter().find_map(|joint| {
+pub fn effect_outside_mujoco(joints: &[JointModel]) -> Option<&'static str> {
+    joints.iter().find_map(|joint| {
         let ActuatorParams {
             saturation,
             torque_delay,

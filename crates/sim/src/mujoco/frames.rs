@@ -4,16 +4,11 @@
 
 use std::io::{Error, ErrorKind, Read, Write};
 
-use twinstep_model::{Command, InitialState, NUM_JOINTS, RobotStates};
-
 /// Version of the frames. The Python package has the same one.
-const PROTOCOL: u32 = 2;
+const PROTOCOL: u32 = 3;
 const GREETING: &str = "twinstep-mujoco";
 /// Longest frame [bytes].
 const MAX_FRAME: usize = 1 << 28;
-/// Numbers of a robot in the sensor readings, and in the ground truth.
-const ROW: (usize, usize) = (3 * NUM_JOINTS + 4 + 3, 3 + 3 + 3 + 4 + 1);
-
 /// Kind of the first request and of its reply.
 pub const HELLO: u8 = b'H';
 /// Kind of a reset.
@@ -29,6 +24,24 @@ pub const ERROR: u8 = b'E';
 
 /// Kind and body of a frame.
 pub type Frame = (u8, Vec<u8>);
+
+/// Joints and geoms of the robots, in the order of every row.
+#[derive(Clone, Debug)]
+pub struct Layout {
+    /// Names of the joints.
+    pub joints: Vec<String>,
+    /// Names of the geoms whose normal forces are read.
+    pub geoms: Vec<String>,
+    /// Index of the body that a robot with a fixed base has as its base; 0 is the world.
+    pub base: usize,
+}
+
+impl Layout {
+    /// Returns the numbers of a robot in the sensor readings, and in the ground truth.
+    fn row(&self) -> (usize, usize) {
+        (3 * self.joints.len() + 4 + 3, 3 + 3 + 3 + self.geoms.len())
+    }
+}
 
 /// Settings of the process.
 pub struct Settings {
@@ -46,10 +59,35 @@ pub struct Settings {
 pub struct Reset<'a> {
     /// The robot.
     pub robot: usize,
-    /// Its state, with true joint positions instead of encoder readings.
-    pub initial_state: &'a InitialState,
+    /// Its state: position, orientation, linear and angular velocity of the base, true positions and velocities of the joints.
+    pub state: Vec<f32>,
     /// Its model.
     pub mjcf: &'a str,
+}
+
+/// Position, velocity, feed-forward torque and gains of the joints of a robot.
+pub type CommandRow<'a> = [&'a [f32]; 5];
+
+/// States of one robot.
+pub struct StateRow<'a> {
+    /// Joint positions [rad or m].
+    pub q: &'a [f32],
+    /// Joint velocities [rad/s or m/s].
+    pub dq: &'a [f32],
+    /// Torques, means over the last actuator period [N·m or N].
+    pub tau: &'a [f32],
+    /// Rotation world-from-base, `[w, x, y, z]`.
+    pub orientation: [f32; 4],
+    /// Angular velocity in the base frame [rad/s].
+    pub gyro: [f32; 3],
+    /// Position of the base [m].
+    pub base_position: [f32; 3],
+    /// Velocity of the base in the world frame [m/s].
+    pub base_linear_velocity: [f32; 3],
+    /// Angular velocity of the base in the base frame [rad/s].
+    pub base_angular_velocity: [f32; 3],
+    /// Normal force on each geom of the layout [N].
+    pub geom_force: &'a [f32],
 }
 
 /// Writes a frame.
@@ -81,10 +119,12 @@ pub fn read_frame(stream: &mut impl Read) -> Result<Option<Frame>, Error> {
 }
 
 /// Returns the body of the first request. `mjcf` is the nominal model.
-pub fn hello(settings: &Settings, mjcf: &str) -> Vec<u8> {
+pub fn hello(settings: &Settings, layout: &Layout, mjcf: &str) -> Vec<u8> {
     let Settings { robots, threads, iterations, steps } = settings;
-    format!("{GREETING} {PROTOCOL} robots={robots} threads={threads} iterations={iterations} steps={steps}\n{mjcf}")
-        .into_bytes()
+    let Layout { joints, geoms, base } = layout;
+    let (joints, geoms) = (joints.join("\t"), geoms.join("\t"));
+    let settings = format!("robots={robots} threads={threads} iterations={iterations} steps={steps} base={base}");
+    format!("{GREETING} {PROTOCOL} {settings}\n{joints}\n{geoms}\n{mjcf}").into_bytes()
 }
 
 /// Checks the reply to the first request.
@@ -100,21 +140,9 @@ pub fn check_greeting(body: &[u8]) -> Result<(), String> {
 pub fn reset(resets: &[Reset]) -> Vec<u8> {
     let mut body = Vec::new();
     put_number(&mut body, resets.len());
-    for Reset { robot, initial_state, mjcf } in resets {
+    for Reset { robot, state, mjcf } in resets {
         put_number(&mut body, *robot);
-        let InitialState {
-            base_position,
-            base_orientation,
-            base_linear_velocity,
-            base_angular_velocity,
-            q,
-            dq,
-            actuator_seed: _,
-        } = initial_state;
-        let values: [&[f32]; 6] = [base_position, base_orientation, base_linear_velocity, base_angular_velocity, q, dq];
-        for values in values {
-            put(&mut body, values);
-        }
+        put(&mut body, state);
         put_number(&mut body, mjcf.len());
         body.extend_from_slice(mjcf.as_bytes());
     }
@@ -130,43 +158,54 @@ pub fn push(robot: usize, velocity: [f32; 3]) -> Vec<u8> {
 }
 
 /// Returns the body of a step.
-pub fn step(commands: &[Command], active: &[bool], actuator_periods: usize) -> Vec<u8> {
-    let mut body = Vec::with_capacity(4 + commands.len() * (1 + size_of::<Command>()));
+pub fn step<'a>(
+    commands: impl IntoIterator<Item = CommandRow<'a>>,
+    active: &[bool],
+    actuator_periods: usize,
+) -> Vec<u8> {
+    let mut body = Vec::new();
     put_number(&mut body, actuator_periods);
     body.extend(active.iter().map(|active| u8::from(*active)));
-    for Command { q, dq, tau_ff, kp, kd } in commands {
-        for values in [q, dq, tau_ff, kp, kd] {
-            put(&mut body, values);
-        }
+    for values in commands.into_iter().flatten() {
+        put(&mut body, values);
     }
     body
 }
 
-/// Reads a reply with the states of `robots` into their entries of `states`.
-pub fn read_states(body: &[u8], robots: &[usize], states: &mut RobotStates) -> Result<(), String> {
-    let (measured_len, truth_len) = ROW;
+/// Reads a reply with the states of `robots`, and calls `read` for each.
+pub fn read_states(
+    body: &[u8],
+    layout: &Layout,
+    robots: &[usize],
+    mut read: impl FnMut(usize, StateRow),
+) -> Result<(), String> {
+    let (measured_len, truth_len) = layout.row();
     let expected = 4 * robots.len() * (measured_len + truth_len);
     if body.len() != expected {
         return Err(format!("it wrote the states of its robots in {} bytes; {expected} are expected", body.len()));
     }
     let numbers: Vec<f32> = body.as_chunks().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
     let (measured, truth) = numbers.split_at(robots.len() * measured_len);
-    for (robot, (measured, truth)) in
+    for (robot, (mut measured, mut truth)) in
         robots.iter().zip(measured.chunks_exact(measured_len).zip(truth.chunks_exact(truth_len)))
     {
-        let RobotStates { measured: readings, truth: truths } = states;
-        let mut numbers = measured;
-        for values in [&mut readings.q, &mut readings.dq, &mut readings.tau] {
-            values[*robot] = take::<NUM_JOINTS>(&mut numbers);
-        }
-        readings.orientation[*robot] = take(&mut numbers);
-        readings.gyro[*robot] = take(&mut numbers);
-        let mut numbers = truth;
-        truths.base_position[*robot] = take(&mut numbers);
-        truths.base_linear_velocity[*robot] = take(&mut numbers);
-        truths.base_angular_velocity[*robot] = take(&mut numbers);
-        truths.foot_force[*robot] = take(&mut numbers);
-        truths.body_contact[*robot] = take::<1>(&mut numbers) == [1.0];
+        let [q, dq, tau] = std::array::from_fn(|_| {
+            let (first, rest) = measured.split_at(layout.joints.len());
+            measured = rest;
+            first
+        });
+        let row = StateRow {
+            q,
+            dq,
+            tau,
+            orientation: take(&mut measured),
+            gyro: take(&mut measured),
+            base_position: take(&mut truth),
+            base_linear_velocity: take(&mut truth),
+            base_angular_velocity: take(&mut truth),
+            geom_force: truth,
+        };
+        read(*robot, row);
     }
     Ok(())
 }
@@ -209,31 +248,38 @@ mod tests {
         assert_eq!(read_frame(&mut &b"\x09\0\0\0Dab"[..]).expect("the end"), None);
     }
 
+    fn layout(joints: usize, geoms: usize) -> Layout {
+        let names = |count: usize| (0..count).map(|index| index.to_string()).collect();
+        Layout { joints: names(joints), geoms: names(geoms), base: 1 }
+    }
+
     #[test]
-    fn states_are_read_into_the_entries_of_their_robots() {
-        let (measured, truth) = ROW;
-        let numbers = (0..measured + truth).map(|index| index as f32);
-        let mut body: Vec<u8> = numbers.flat_map(f32::to_le_bytes).collect();
-        let mut states = RobotStates::new(2);
-        read_states(&body, &[1], &mut states).expect("the states of one robot");
-        assert_eq!((states.measured.q[1][1], states.measured.dq[1][0], states.measured.tau[1][11]), (1.0, 12.0, 35.0));
-        assert_eq!((states.measured.orientation[1][0], states.measured.gyro[1][2]), (36.0, 42.0));
-        assert_eq!((states.truth.base_position[1][0], states.truth.foot_force[1][3]), (43.0, 55.0));
-        assert_eq!(states.measured.q[0], [0.0; NUM_JOINTS]);
+    fn states_are_read_for_their_robots() {
+        let layout = layout(12, 9);
+        let (measured, truth) = layout.row();
+        let mut body: Vec<u8> = (0..measured + truth).map(|index| index as f32).flat_map(f32::to_le_bytes).collect();
+        let mut seen = Vec::new();
+        read_states(&body, &layout, &[3], |robot, row| {
+            seen.push(robot);
+            assert_eq!((row.q[1], row.dq[0], row.tau[11]), (1.0, 12.0, 35.0));
+            assert_eq!((row.orientation[0], row.gyro[2]), (36.0, 42.0));
+            assert_eq!((row.base_position[0], row.geom_force[3], row.geom_force.len()), (43.0, 55.0, 9));
+        })
+        .expect("the states of one robot");
+        assert_eq!(seen, [3]);
         body.pop();
-        let error = read_states(&body, &[1], &mut states).expect_err("too short");
-        assert_eq!(error, "it wrote the states of its robots in 227 bytes; 228 are expected");
+        let error = read_states(&body, &layout, &[1], |_, _| {}).expect_err("too short");
+        assert_eq!(error, "it wrote the states of its robots in 243 bytes; 244 are expected");
     }
 
     #[test]
     fn sizes_are_those_of_the_table() {
-        let robot = twinstep_model::go2();
-        let initial_state = InitialState::at_rest(0.3, robot.control.default_pose_f32());
-        assert_eq!(
-            reset(&[Reset { robot: 3, initial_state: &initial_state, mjcf: "<a/>" }]).len(),
-            4 + 4 + 148 + 4 + 4
-        );
-        let command = Command::hold(initial_state.q, 40.0, 1.0);
-        assert_eq!(step(&[command; 2], &[true, false], 4).len(), 4 + 2 * (1 + 240));
+        let state = vec![0.0; 13 + 2 * 12];
+        assert_eq!(reset(&[Reset { robot: 3, state, mjcf: "<a/>" }]).len(), 4 + 4 + 148 + 4 + 4);
+        let row = [0.0; 12];
+        assert_eq!(step([[&row[..]; 5]; 2], &[true, false], 4).len(), 4 + 2 * (1 + 240));
+        let settings = Settings { robots: 1, threads: 2, iterations: 3, steps: 4 };
+        let text = String::from_utf8(hello(&settings, &layout(2, 1), "<mujoco/>")).expect("a text");
+        assert_eq!(text, "twinstep-mujoco 3 robots=1 threads=2 iterations=3 steps=4 base=1\n0\t1\n0\n<mujoco/>");
     }
 }

@@ -10,22 +10,25 @@ mod frames;
 mod plant;
 mod plant_actuator;
 mod process;
+mod trees;
 
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 use twinstep_model::{
-    Backend, BackendError, Command, CompliantStand, Ground, GroundTruth, InitialState, Measured, MjcfActuator,
-    MjcfOptions, PerJoint, RobotModel, RobotStates, Simulator, mjcf,
+    Backend, BackendError, Command, CompliantStand, Ground, GroundTruth, InitialState, JOINT_NAMES, Leg, Measured,
+    MjcfActuator, MjcfOptions, NUM_LEGS, PerJoint, RobotModel, RobotStates, Simulator, mjcf,
 };
 
 use crate::checks::check_lengths;
 use crate::{BackendBuildError, SimConfig};
 use delay::CommandDelay;
-use effects::{Adjustments, unsupported};
+use effects::Adjustments;
+pub use effects::effect_outside_mujoco;
 pub use plant::MujocoPlant;
+pub use trees::MujocoTrees;
 
-use frames::{PUSH, RESET, Reset, STATES, STEP, Settings};
+use frames::{Layout, PUSH, RESET, Reset, STATES, STEP, Settings, StateRow};
 use process::Process;
 
 /// Environment variable with the Python interpreter that has the packages `twinstep` and `mujoco`.
@@ -73,7 +76,7 @@ impl MujocoBackend {
     ) -> Result<Self, BackendBuildError> {
         config.check(robot.control.actuator_hz)?;
         let config = config.at_actuator_rate(robot.control.actuator_hz);
-        if let Some(effect) = unsupported(&robot) {
+        if let Some(effect) = effect_outside_mujoco(&robot.joints) {
             return Err(BackendBuildError::Effect { engine: ENGINE, effect });
         }
         let timestep = 1.0 / f64::from(config.physics_hz());
@@ -86,7 +89,7 @@ impl MujocoBackend {
             iterations: config.solver_iterations(),
             steps: config.steps_per_actuator_period(robot.control.actuator_hz),
         };
-        let process = Process::start(python, &frames::hello(&settings, &mjcf(&robot, &options)))
+        let process = Process::start(python, &frames::hello(&settings, &layout(), &mjcf(&robot, &options)))
             .map_err(|reason| BackendBuildError::Mujoco { python: PathBuf::from(python), reason })?;
         let (states, adjustments) = (RobotStates::new(num_robots), vec![Adjustments::new(&robot); num_robots]);
         let delays = vec![None; num_robots];
@@ -99,7 +102,7 @@ impl MujocoBackend {
 
     /// Returns true if MuJoCo simulates every effect of `robot` without a [`MujocoPlant`].
     pub fn simulates(robot: &RobotModel) -> bool {
-        unsupported(robot).is_none()
+        effect_outside_mujoco(&robot.joints).is_none()
     }
 
     /// Returns the id of the process.
@@ -116,10 +119,13 @@ impl MujocoBackend {
     fn request(&mut self, kind: u8, body: &[u8], robots: &[usize]) -> Result<(), BackendError> {
         let failed = |reason| BackendError::EngineProcess { engine: ENGINE, reason };
         let reply = self.process.request(kind, body, STATES).map_err(failed)?;
-        frames::read_states(&reply, robots, &mut self.states).map_err(|reason| {
-            self.process.fail(reason.clone());
-            failed(reason)
-        })?;
+        let states = &mut self.states;
+        frames::read_states(&reply, &layout(), robots, |robot, row| set_state(states, robot, &row)).map_err(
+            |reason| {
+                self.process.fail(reason.clone());
+                failed(reason)
+            },
+        )?;
         let measured = &mut self.states.measured;
         for robot in robots {
             self.adjustments[*robot].readings(&mut measured.q[*robot], &mut measured.gyro[*robot]);
@@ -131,7 +137,9 @@ impl MujocoBackend {
     fn advance(&mut self, commands: &[Command], active: &[bool], periods: usize) -> Result<(), BackendError> {
         let adjusted =
             commands.iter().zip(&self.adjustments).map(|(command, adjustments)| adjustments.command(command));
-        let body = frames::step(&adjusted.collect::<Vec<_>>(), active, periods);
+        let adjusted: Vec<_> = adjusted.collect();
+        let rows = adjusted.iter().map(|Command { q, dq, tau_ff, kp, kd }| [q, dq, tau_ff, kp, kd].map(|row| &row[..]));
+        let body = frames::step(rows, active, periods);
         self.request(STEP, &body, &(0..self.num_robots()).collect::<Vec<_>>())
     }
 
@@ -139,8 +147,8 @@ impl MujocoBackend {
     fn reset_robots(&mut self, robots: &[(usize, InitialState)], mjcf: &str) -> Result<(), BackendError> {
         let true_states: Vec<_> =
             robots.iter().map(|(robot, state)| (*robot, self.adjustments[*robot].initial_state(state))).collect();
-        let reset = |(robot, initial_state)| Reset { robot, initial_state, mjcf };
-        let resets: Vec<_> = true_states.iter().map(|(robot, state)| reset((*robot, state))).collect();
+        let reset = |(robot, state): &(usize, InitialState)| Reset { robot: *robot, state: state_row(state), mjcf };
+        let resets: Vec<_> = true_states.iter().map(reset).collect();
         let indices: Vec<_> = robots.iter().map(|(robot, _)| *robot).collect();
         self.request(RESET, &frames::reset(&resets), &indices)?;
         for robot in indices {
@@ -186,7 +194,7 @@ impl Backend for MujocoBackend {
         initial_state: &InitialState,
     ) -> Result<(), BackendError> {
         self.check_index(robot)?;
-        if let Some(effect) = unsupported(model) {
+        if let Some(effect) = effect_outside_mujoco(&model.joints) {
             return Err(BackendError::UnsupportedEffect { robot, engine: ENGINE, effect });
         }
         self.adjustments[robot] = Adjustments::new(model);
@@ -237,6 +245,35 @@ impl Simulator for MujocoBackend {
     fn set_derating(&mut self, robot: usize, factors: &PerJoint) {
         self.adjustments[robot].derating = *factors;
     }
+}
+
+/// Returns joints and geoms of a quadruped: its feet, then what is not to touch the ground. A knee is the lower end of a thigh.
+fn layout() -> Layout {
+    let names = |end: &str| Leg::ALL.map(|leg| format!("{}_{end}", leg.name()));
+    let geoms = names("foot").into_iter().chain(["trunk".to_owned()]).chain(names("knee"));
+    Layout { joints: JOINT_NAMES.map(str::to_owned).to_vec(), geoms: geoms.collect(), base: 1 }
+}
+
+fn set_state(states: &mut RobotStates, robot: usize, row: &StateRow) {
+    let RobotStates { measured, truth } = states;
+    for (own, values) in [(&mut measured.q, row.q), (&mut measured.dq, row.dq), (&mut measured.tau, row.tau)] {
+        own[robot].copy_from_slice(values);
+    }
+    (measured.orientation[robot], measured.gyro[robot]) = (row.orientation, row.gyro);
+    truth.base_position[robot] = row.base_position;
+    truth.base_linear_velocity[robot] = row.base_linear_velocity;
+    truth.base_angular_velocity[robot] = row.base_angular_velocity;
+    let (feet, body) = row.geom_force.split_at(NUM_LEGS);
+    truth.foot_force[robot].copy_from_slice(feet);
+    truth.body_contact[robot] = body.iter().any(|force| *force > 0.0);
+}
+
+/// Returns the numbers of a reset.
+fn state_row(state: &InitialState) -> Vec<f32> {
+    let InitialState { base_position, base_orientation, base_linear_velocity, base_angular_velocity, q, dq, .. } =
+        state;
+    let values: [&[f32]; 6] = [base_position, base_orientation, base_linear_velocity, base_angular_velocity, q, dq];
+    values.concat()
 }
 
 /// Returns the interpreter of the environment variable [`PYTHON`], or else `python3`.

@@ -3,21 +3,24 @@
 ========  ======================================================================================================
 request   body
 ========  ======================================================================================================
-``H``     text: ``twinstep-mujoco VERSION robots=N threads=N iterations=N steps=N``, newline, nominal model (MJCF)
-``R``     reset: number of robots; for each its index, ``INITIAL_STATE``, length of its model, its model (MJCF).
+``H``     text: ``twinstep-mujoco VERSION robots=N threads=N iterations=N steps=N base=N``, newline, names of the
+          joints, newline, names of the geoms, newline, nominal model (MJCF). Names are separated by tabs. ``base`` is
+          the index of the body that a robot with a fixed base has as its base; 0 is the world.
+``R``     reset: number of robots; for each its index, ``initial_state``, length of its model, its model (MJCF).
           The length 0 selects the nominal model.
 ``P``     push: index of a robot, three ``<f4``: velocity added to that of its base, in the world frame [m/s]
-``S``     step: number of actuator periods; one byte per robot, 0 if it is not stepped; ``COMMAND`` per robot
+``S``     step: number of actuator periods; one byte per robot, 0 if it is not stepped; ``command`` per robot
 ========  ======================================================================================================
 
-The reply to ``H`` is the text ``twinstep-mujoco VERSION mujoco=VERSION``. The reply to a reset is ``MEASURED`` for each
-of its robots, then ``GROUND_TRUTH`` for each; to a push the same for its robot; to a step the same for all
-robots. Any request may be answered by ``E``,
+Rows are those of :class:`Layout`. The reply to ``H`` is the text ``twinstep-mujoco VERSION mujoco=VERSION``. The reply
+to a reset is ``measured`` for each of its robots, then ``truth`` for each; to a push the same for its robot; to a step
+the same for all robots. Any request may be answered by ``E``,
 the text of an error, after which the process terminates. The robot that diverged has NaN in every reading.
 """
 
 import struct
 from dataclasses import dataclass
+from functools import cached_property
 from typing import BinaryIO
 
 import numpy as np
@@ -25,7 +28,7 @@ from numpy.typing import NDArray
 
 from ..errors import Error
 
-PROTOCOL = 2
+PROTOCOL = 3
 """Version of the frames. The server has the same one."""
 
 GREETING = "twinstep-mujoco"
@@ -36,36 +39,39 @@ _PUSH = struct.Struct("<I3f")
 Rows = NDArray[np.void]
 """Structured array with one row per robot."""
 
-INITIAL_STATE = np.dtype(
-    [
-        ("base_position", "<f4", 3),
-        ("base_orientation", "<f4", 4),
-        ("base_linear_velocity", "<f4", 3),
-        ("base_angular_velocity", "<f4", 3),
-        ("q", "<f4", 12),
-        ("dq", "<f4", 12),
-    ]
-)
-"""Initial state of a robot: position [m], world-from-base (w, x, y, z), velocities, joints in ``JOINT_ORDER``."""
 
-COMMAND = np.dtype([("q", "<f4", 12), ("dq", "<f4", 12), ("tau_ff", "<f4", 12), ("kp", "<f4", 12), ("kd", "<f4", 12)])
-"""Command of a robot: the torque is ``kp (q - q_measured) + kd (dq - dq_measured) + tau_ff``, clipped to the limit."""
+@dataclass(frozen=True)
+class Layout:
+    """Joints and geoms of the robots, in the order of every row. Numbers are ``<f4``."""
 
-MEASURED = np.dtype(
-    [("q", "<f4", 12), ("dq", "<f4", 12), ("tau", "<f4", 12), ("orientation", "<f4", 4), ("gyro", "<f4", 3)]
-)
-"""Sensor readings. ``tau`` is the mean over the last actuator period [N·m], ``gyro`` is in the base frame [rad/s]."""
+    joints: tuple[str, ...]
+    geoms: tuple[str, ...]
 
-GROUND_TRUTH = np.dtype(
-    [
-        ("base_position", "<f4", 3),
-        ("base_linear_velocity", "<f4", 3),
-        ("base_angular_velocity", "<f4", 3),
-        ("foot_force", "<f4", 4),
-        ("body_contact", "<f4"),
-    ]
-)
-"""What no sensor measures: velocity in the world frame, angular velocity in the base frame, normal forces [N]."""
+    @cached_property
+    def initial_state(self) -> np.dtype[np.void]:
+        """Initial state: position [m], world-from-base (w, x, y, z), velocities; joints."""
+        base = [("base_position", "<f4", 3), ("base_orientation", "<f4", 4)]
+        base += [("base_linear_velocity", "<f4", 3), ("base_angular_velocity", "<f4", 3)]
+        return np.dtype([*base, *self._of_joints("q", "dq")])
+
+    @cached_property
+    def command(self) -> np.dtype[np.void]:
+        """Command: the torque is ``kp (q - q_measured) + kd (dq - dq_measured) + tau_ff``, clipped to the limit."""
+        return np.dtype(self._of_joints("q", "dq", "tau_ff", "kp", "kd"))
+
+    @cached_property
+    def measured(self) -> np.dtype[np.void]:
+        """Sensor readings. ``tau`` is the mean over the last actuator period, ``gyro`` is in the base frame [rad/s]."""
+        return np.dtype([*self._of_joints("q", "dq", "tau"), ("orientation", "<f4", 4), ("gyro", "<f4", 3)])
+
+    @cached_property
+    def truth(self) -> np.dtype[np.void]:
+        """What no sensor measures: linear velocity in the world frame, angular in the base frame, normal forces [N]."""
+        base = [(name, "<f4", 3) for name in ("base_position", "base_linear_velocity", "base_angular_velocity")]
+        return np.dtype([*base, ("geom_force", "<f4", (len(self.geoms),))])
+
+    def _of_joints(self, *names: str) -> list[tuple[str, str, tuple[int]]]:
+        return [(name, "<f4", (len(self.joints),)) for name in names]
 
 
 class FrameError(Error):
@@ -80,6 +86,8 @@ class Hello:
     threads: int
     iterations: int
     steps: int
+    base: int
+    layout: Layout
     mjcf: str
 
 
@@ -145,17 +153,21 @@ def parse_hello(body: bytes) -> Hello:
         The program that wrote it has another version, or it is not a first request.
     """
     try:
-        line, _, mjcf = body.decode().partition("\n")
+        line, joints, geoms, mjcf = body.decode().split("\n", 3)
         name, version, *settings = line.split(" ")
         if name != GREETING or int(version) != PROTOCOL:
             raise FrameError(f"the first request starts with `{name} {version}`, not `{GREETING} {PROTOCOL}`")
         numbers = {key: int(value) for key, value in (setting.split("=") for setting in settings)}
-        return Hello(**numbers, mjcf=mjcf)
+        return Hello(**numbers, layout=Layout(_names(joints), _names(geoms)), mjcf=mjcf)
     except (ValueError, TypeError) as error:
         raise FrameError(f"the first request cannot be read: {error}") from error
 
 
-def parse_reset(body: bytes) -> list[Reset]:
+def _names(line: str) -> tuple[str, ...]:
+    return tuple(line.split("\t")) if line else ()
+
+
+def parse_reset(body: bytes, layout: Layout) -> list[Reset]:
     """Parse a reset."""
     at = 0
 
@@ -172,7 +184,7 @@ def parse_reset(body: bytes) -> list[Reset]:
 
     resets = list[Reset]()
     for _ in range(number()):
-        robot, initial_state = number(), np.frombuffer(take(INITIAL_STATE.itemsize), INITIAL_STATE)
+        robot, initial_state = number(), np.frombuffer(take(layout.initial_state.itemsize), layout.initial_state)
         try:
             resets.append(Reset(robot, initial_state, take(number()).decode()))
         except UnicodeDecodeError as error:
@@ -190,14 +202,14 @@ def parse_push(body: bytes) -> Push:
     return Push(robot, velocity)
 
 
-def parse_step(body: bytes, robots: int) -> Step:
+def parse_step(body: bytes, robots: int, layout: Layout) -> Step:
     """Parse a step of ``robots`` robots."""
-    expected = _LENGTH.size + robots * (1 + COMMAND.itemsize)
+    expected = _LENGTH.size + robots * (1 + layout.command.itemsize)
     if len(body) != expected:
         raise FrameError(f"a step of {robots} robots has {len(body)} bytes; {expected} are expected")
     (periods,) = _LENGTH.unpack_from(body)
     active = np.frombuffer(body, np.uint8, robots, _LENGTH.size) != 0
-    return Step(periods, active, np.frombuffer(body, COMMAND, robots, _LENGTH.size + robots))
+    return Step(periods, active, np.frombuffer(body, layout.command, robots, _LENGTH.size + robots))
 
 
 def reset_body(resets: list[Reset]) -> bytes:

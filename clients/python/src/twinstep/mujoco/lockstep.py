@@ -8,8 +8,6 @@ import numpy as np
 
 from ..errors import Error
 from .frames import (
-    GROUND_TRUTH,
-    MEASURED,
     FrameError,
     Hello,
     Push,
@@ -42,9 +40,14 @@ class Robots:
     def __init__(self, hello: Hello) -> None:
         self._compiler = Compiler(hello.iterations)
         self._nominal = self._compile(hello.mjcf)
-        self._robots = [Robot(self._compiler, self._nominal) for _ in range(hello.robots)]
+        layout = hello.layout
+        try:
+            robots = range(hello.robots)
+            self._robots = [Robot(self._compiler, self._nominal, layout, hello.base) for _ in robots]
+        except ValueError as error:
+            raise ModelError(str(error)) from error
         self._steps = hello.steps
-        self._measured, self._truth = np.zeros(hello.robots, MEASURED), np.zeros(hello.robots, GROUND_TRUTH)
+        self._measured, self._truth = np.zeros(hello.robots, layout.measured), np.zeros(hello.robots, layout.truth)
         threads = min(hello.threads or os.cpu_count() or 1, hello.robots)
         # `mj_step` releases the lock of the interpreter.
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
@@ -113,11 +116,11 @@ def serve(requests: BinaryIO, replies: BinaryIO) -> None:
         while (frame := read_frame(requests)) is not None:
             match frame[0]:
                 case b"R":
-                    reply = robots.reset(parse_reset(frame[1]))
+                    reply = robots.reset(parse_reset(frame[1], hello.layout))
                 case b"P":
                     reply = robots.push(parse_push(frame[1]))
                 case b"S":
-                    reply = robots.step(parse_step(frame[1], hello.robots))
+                    reply = robots.step(parse_step(frame[1], hello.robots, hello.layout))
                 case kind:
                     raise FrameError(f"{kind!r} is not a request")
             write_frame(replies, b"D", reply)
