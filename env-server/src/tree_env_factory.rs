@@ -11,10 +11,15 @@ use twinstep_sim::{BackendBuildError, Placement, SimConfig, TreeSimulation};
 use crate::tree_env::{TreeEnv, TreeEnvConfig};
 use crate::{Config, EnvFactory, EnvFactoryError};
 
-/// Rate of actuators and policy [Hz] and joint offset of an action of 1 [rad] if the model file states none.
+/// Rate of actuators and policy [Hz] if the model file states none.
 const ACTUATOR_HZ: f64 = 200.0;
 const POLICY_HZ: f64 = 50.0;
+/// Joint offset of an action of 1 [rad] if neither model file nor torque limits state one.
 const ACTION_SCALE: f64 = 0.25;
+/// Share of the torque limit that an action of 1 exerts at rest, if the model file states no action scale: that of the Go2.
+const ACTION_TORQUE: f64 = 0.5;
+/// Range of the action scale that follows from torque limits [rad].
+const ACTION_SCALES: [f64; 2] = [0.1, 1.0];
 
 /// Builds environments of the tasks `pose` and `walk` for the robot of a model file, of any tree.
 pub struct TreeEnvFactory {
@@ -151,17 +156,20 @@ fn controlled_robot(
     base: BaseMount,
 ) -> Result<ControlledRobot, EnvFactoryError> {
     let joints: Vec<String> = robot.tree.joints.iter().map(|joint| joint.name.clone()).collect();
-    let gain = |key: &'static str, gains: &Option<NominalGain>, joint: &str| {
+    let of_robot_file = &file.of_robot_file.gains;
+    let gain = |(index, key): (usize, &'static str), gains: &Option<NominalGain>, joint: &str| {
+        let stated = gains.as_ref().and_then(|gains| gains.of(joint));
         let missing = || EnvFactoryError::NoGain { key, joint: joint.to_owned() };
-        gains.as_ref().and_then(|gains| gains.of(joint)).ok_or_else(missing)
+        stated.or_else(|| Some(of_robot_file.get(joint)?[index])).ok_or_else(missing)
     };
-    let gains = joints.iter().map(|joint| Ok([gain("kp", &file.kp, joint)?, gain("kd", &file.kd, joint)?]));
+    let gains = joints.iter().map(|joint| Ok([gain((0, "kp"), &file.kp, joint)?, gain((1, "kd"), &file.kd, joint)?]));
     let gains = gains.collect::<Result<Vec<_>, EnvFactoryError>>()?;
     let (actuator_hz, policy_hz) = (file.actuator_hz.unwrap_or(ACTUATOR_HZ), file.policy_hz.unwrap_or(POLICY_HZ));
     let decimation = (actuator_hz / policy_hz).round().max(1.0);
     if (decimation * policy_hz - actuator_hz).abs() > 1e-6 * actuator_hz {
         return Err(refused("control.policy_hz", "`actuator_hz` must be a multiple of it"));
     }
+    let action_scale = file.action_scale.unwrap_or_else(|| action_scale(robot, &gains));
     let default_pose = file.pose();
     let is_fixed = base.is_fixed() || robot.tree.base.is_some_and(BaseMount::is_fixed);
     let controlled = ControlledRobot {
@@ -172,7 +180,7 @@ fn controlled_robot(
         default_pose,
         ranges: robot.joints.iter().map(|joint| joint.range).collect(),
         torque_limits: robot.joints.iter().map(|joint| joint.torque_limit).collect(),
-        action_scale: file.action_scale.unwrap_or(ACTION_SCALE),
+        action_scale,
         actuator_dt: 1.0 / actuator_hz,
         decimation: decimation as usize,
         mass: robot.tree.total_mass(),
@@ -180,4 +188,16 @@ fn controlled_robot(
         hips: Vec::new(),
     };
     Ok(controlled.with_feet(robot, &file.groups)?)
+}
+
+/// Returns the joint offset at which the median joint exerts [`ACTION_TORQUE`] of its torque limit [rad].
+fn action_scale(robot: &TreeModel, gains: &[[f64; 2]]) -> f64 {
+    let joints = robot.joints.iter().zip(gains);
+    let mut offsets: Vec<_> = joints
+        .map(|(joint, [kp, _])| ACTION_TORQUE * joint.torque_limit / kp)
+        .filter(|offset| offset.is_finite() && *offset > 0.0)
+        .collect();
+    offsets.sort_by(f64::total_cmp);
+    let median = offsets.get(offsets.len() / 2).copied();
+    median.map_or(ACTION_SCALE, |offset| offset.clamp(ACTION_SCALES[0], ACTION_SCALES[1]))
 }

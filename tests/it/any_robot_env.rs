@@ -186,6 +186,46 @@ fn episodes_of_a_tree_have_their_own_robots_and_are_pushed() {
     }
 }
 
+const CONTROLLED: &str = r#"<mujoco model="leg"><worldbody><body name="base">
+  <inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>
+  <body name="thigh"><joint name="hip" axis="0 1 0"/><inertial pos="0 0 -0.1" mass="1" diaginertia="0.1 0.1 0.1"/>
+    <body name="shank" pos="0 0 -0.2"><joint name="knee" axis="0 1 0"/><inertial pos="0 0 -0.1" mass="1" diaginertia="0.1 0.1 0.1"/></body>
+  </body></body></worldbody>
+  <actuator><position name="hip" joint="hip" kp="30" kv="2"/>
+    <general name="knee" joint="knee" gear="2" biastype="affine" gainprm="10" biasprm="0 -10 -1"/></actuator>
+  <keyframe><key name="other" qpos="1 1"/><key name="home" qpos="0.3 -0.6"/></keyframe></mujoco>"#;
+
+#[test]
+fn robot_file_with_its_own_controllers_and_home_needs_no_model_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("leg.xml");
+    std::fs::write(&path, CONTROLLED).unwrap();
+    let spec = |model: PathBuf| {
+        let mut config = pose_config("so101");
+        config.server.model = Some(model);
+        TreeEnvFactory::new(&config)
+            .map(|factory| factory.build(1, AutoresetMode::Disabled, None).unwrap().spec().clone())
+    };
+    let own = spec(path).unwrap();
+    // The gear of the second one is 2.
+    assert_eq!(own.joint_gains, [[30.0, 2.0], [40.0, 4.0]]);
+    assert_eq!(own.default_pose, [0.3, -0.6]);
+    assert_eq!(own.action_scale, 0.25, "there are no torque limits");
+    let model = folder.path().join("leg.toml");
+    let text = "robot = \"leg.xml\"\n[joints.rename]\nhip = \"Hip\"\n[control]\nkp = { knee = 5.0 }\ndefault_pose = { knee = 0.0 }\n";
+    std::fs::write(&model, text).unwrap();
+    let stated = spec(model).unwrap();
+    assert_eq!((stated.joint_gains, stated.default_pose), (vec![[30.0, 2.0], [5.0, 4.0]], vec![0.3, 0.0]));
+    let limited = folder.path().join("limited.xml");
+    std::fs::write(&limited, CONTROLLED.replace("kv=\"2\"", "kv=\"2\" forcerange=\"-24 24\"")).unwrap();
+    assert_eq!(spec(limited).unwrap().action_scale, 0.4, "half of the torque of the hip");
+    let motors = folder.path().join("motors.xml");
+    std::fs::write(&motors, CONTROLLED.replace("<position name=\"hip\" joint=\"hip\" kp=\"30\" kv=\"2\"/>", ""))
+        .unwrap();
+    let error = spec(motors).unwrap_err().to_string();
+    assert!(error.contains("states no `kp` of joint `hip`"), "{error}");
+}
+
 #[test]
 fn settings_that_a_tree_does_not_have_are_refused_by_name() {
     let error = |change: &dyn Fn(&mut Config)| {

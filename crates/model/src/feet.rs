@@ -1,6 +1,6 @@
 //! Feet of a robot of any tree: their position and velocity in the base frame, from joint positions and velocities.
 
-use glam::{DVec3, Mat3, Quat, Vec3};
+use glam::{DVec3, Mat3, Vec3};
 
 use crate::{Leg, NUM_LEGS, RobotModel, RobotTree, TreeJointKind};
 
@@ -40,9 +40,30 @@ struct Link {
     joint: usize,
     kind: TreeJointKind,
     axis: Vec3,
-    /// Rotation and place of the child's frame in the parent's at position 0.
-    rotation: Mat3,
+    /// Rotation of the child's frame in the parent's at position 0; `None` if they are parallel.
+    rotation: Option<Mat3>,
+    /// Place of the child's frame in the parent's [m].
     place: Vec3,
+}
+
+/// Rotation about an axis.
+struct Turn {
+    axis: Vec3,
+    sine: f32,
+    cosine: f32,
+}
+
+impl Turn {
+    fn new(axis: Vec3, angle: f32) -> Self {
+        let (sine, cosine) = angle.sin_cos();
+        Self { axis, sine, cosine }
+    }
+
+    /// Returns the turned vector, by Rodrigues' formula.
+    fn of(&self, vector: Vec3) -> Vec3 {
+        let Self { axis, sine, cosine } = *self;
+        cosine * vector + sine * axis.cross(vector) + ((1.0 - cosine) * axis.dot(vector)) * axis
+    }
 }
 
 impl Feet {
@@ -80,17 +101,19 @@ impl Feet {
                 let (q, dq) = (q[link.joint], dq[link.joint]);
                 match link.kind {
                     TreeJointKind::Revolute => {
-                        let turn = Quat::from_axis_angle(link.axis, q);
-                        position = turn * position;
-                        velocity = turn * velocity + dq * link.axis.cross(position);
+                        let turn = Turn::new(link.axis, q);
+                        position = turn.of(position);
+                        velocity = turn.of(velocity) + dq * link.axis.cross(position);
                     }
                     TreeJointKind::Prismatic => {
                         position += q * link.axis;
                         velocity += dq * link.axis;
                     }
                 }
-                position = link.place + link.rotation * position;
-                velocity = link.rotation * velocity;
+                if let Some(rotation) = link.rotation {
+                    (position, velocity) = (rotation * position, rotation * velocity);
+                }
+                position += link.place;
             }
             FootMotion { position, velocity }
         })
@@ -114,11 +137,12 @@ fn chain(tree: &RobotTree, body: usize) -> Vec<Link> {
     let (mut body, mut chain) = (body, Vec::new());
     while body > 0 {
         let joint = &tree.joints[body - 1];
+        let rotation = joint.parent_from_child.matrix3.as_mat3();
         chain.push(Link {
             joint: body - 1,
             kind: joint.kind,
             axis: joint.axis.as_vec3(),
-            rotation: joint.parent_from_child.matrix3.as_mat3(),
+            rotation: Some(rotation).filter(|rotation| *rotation != Mat3::IDENTITY),
             place: joint.parent_from_child.translation.as_vec3(),
         });
         body = joint.parent;

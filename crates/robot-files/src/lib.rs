@@ -23,6 +23,7 @@ mod urdf;
 mod write_mjcf;
 mod xml;
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use twinstep_model::RobotTree;
@@ -42,6 +43,17 @@ pub struct RobotFile {
     pub tree: RobotTree,
     /// What the file has and the tree does not, one sentence each.
     pub notes: Vec<String>,
+    /// Gains and pose of the controllers inside the file.
+    pub control: FileControl,
+}
+
+/// Gains and pose that an MJCF file states for the controllers inside its actuators.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct FileControl {
+    /// Position gain [N·m/rad or N/m] and velocity gain [N·m·s/rad or N·s/m] of each joint with one position actuator.
+    pub gains: BTreeMap<String, [f64; 2]>,
+    /// Position of each joint in the keyframe `home`, or else in the first one [rad or m]; empty without keyframe.
+    pub home: BTreeMap<String, f64>,
 }
 
 /// Reads the text of a URDF or MJCF file. `folder` is that of the file: files that it includes, and meshes, are in it.

@@ -6,7 +6,7 @@ use glam::{DAffine3, DMat3, DVec3};
 use twinstep_model::{BaseMount, FreeJoint, RigidBody, RobotTree, TreeBody, TreeJoint, TreeShape, TreeShapeKind};
 
 use crate::inertia::{is_real, transformed};
-use crate::{RobotFile, RobotFileError};
+use crate::{FileControl, RobotFile, RobotFileError};
 
 /// A tree that grows.
 pub struct TreeBuilder {
@@ -120,6 +120,6 @@ impl TreeBuilder {
                 return error("its mass or inertia is not positive");
             }
         }
-        Ok(RobotFile { tree, notes })
+        Ok(RobotFile { tree, notes, control: FileControl::default() })
     }
 }

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use toml::{Table, Value};
 use twinstep_model::{JOINT_NAMES, JointModel, MjcfOptions, NUM_JOINTS, TreeModel, go2, mjcf};
-use twinstep_robot_files::read_robot;
+use twinstep_robot_files::{FileControl, read_robot};
 
 use super::effect_table::{EffectTable, key_error, read_table, write_table};
 use super::error::{EffectEntryError, ModelFileError};
@@ -23,6 +23,9 @@ pub struct TreeModelFile {
     pub robot: String,
     /// The robot without effects, with the names of [`TreeModelFile::rename`].
     pub nominal: TreeModel,
+    /// Gains and pose of the controllers inside the robot file, with the names of [`TreeModelFile::rename`]. They hold where the model file
+    /// states none, for control alone: a measured robot has its own.
+    pub of_robot_file: FileControl,
     /// Names for joints of the robot file, such as those of a log. By the name in the robot file.
     pub rename: BTreeMap<String, String>,
     /// Position gain of each joint [N·m/rad]; `None` if it is unknown.
@@ -35,7 +38,8 @@ pub struct TreeModelFile {
     pub policy_hz: Option<f64>,
     /// Joint offset of an action of 1 [rad].
     pub action_scale: Option<f64>,
-    /// Joint positions to which actions are relative [rad]. Joints that are left out: 0, or the nearest position in their range.
+    /// Joint positions to which actions are relative [rad]. Joints that are left out: their
+    /// position in the keyframe of the robot file, else 0, or the nearest position in their range.
     pub default_pose: BTreeMap<String, f64>,
     /// Links and joints that tasks need, by name.
     pub groups: TreeGroups,
@@ -89,6 +93,7 @@ impl TreeModelFile {
         Self {
             robot: robot.to_owned(),
             nominal,
+            of_robot_file: FileControl::default(),
             rename: BTreeMap::new(),
             kp: None,
             kd: None,
@@ -179,14 +184,14 @@ impl TreeModelFile {
             .map_err(|source| refused(NominalRobotError::Unreadable { path: path.clone(), source }))?;
         let file = read_robot(&text, path.parent())
             .map_err(|cause| refused(NominalRobotError::Import { path: path.clone(), cause }))?;
-        for note in file.notes {
+        for note in &file.notes {
             tracing::warn!("{}: {note}", path.display());
         }
         let nominal = TreeModel::new(file.tree).map_err(|cause| ModelFileError::Malformed {
             name: path.display().to_string(),
             message: cause.to_string(),
         })?;
-        Ok(Self::ideal(&path.display().to_string(), nominal))
+        Ok(Self { of_robot_file: file.control, ..Self::ideal(&path.display().to_string(), nominal) })
     }
 
     fn rename_joints(&mut self, rename: BTreeMap<String, String>) -> Result<(), String> {
@@ -202,6 +207,8 @@ impl TreeModelFile {
         if let Some(twice) = joints.iter().find(|joint| !seen.insert(&joint.name)) {
             return Err(format!("`joints.rename`: two joints are named `{}`", twice.name));
         }
+        let FileControl { gains, home } = std::mem::take(&mut self.of_robot_file);
+        self.of_robot_file = FileControl { gains: renamed(gains, &rename), home: renamed(home, &rename) };
         self.rename = rename;
         Ok(())
     }
@@ -270,7 +277,8 @@ impl TreeModelFile {
     pub fn pose(&self) -> Vec<f64> {
         let joints = self.nominal.tree.joints.iter().zip(&self.nominal.joints);
         let position = |name: &str, [low, high]: [f64; 2]| {
-            self.default_pose.get(name).copied().unwrap_or_else(|| 0f64.clamp(low, high))
+            let stated = self.default_pose.get(name).copied();
+            stated.unwrap_or_else(|| self.of_robot_file.home.get(name).copied().unwrap_or(0.0).clamp(low, high))
         };
         joints.map(|(tree, joint)| position(&tree.name, joint.range)).collect()
     }
@@ -366,6 +374,11 @@ impl TreeModelFile {
         }
         text
     }
+}
+
+/// Returns values by the new names of joints.
+fn renamed<T>(values: BTreeMap<String, T>, rename: &BTreeMap<String, String>) -> BTreeMap<String, T> {
+    values.into_iter().map(|(joint, value)| (rename.get(&joint).cloned().unwrap_or(joint), value)).collect()
 }
 
 /// Returns which number of a joint is impossible, or `None` if none is.

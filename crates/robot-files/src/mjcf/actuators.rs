@@ -48,6 +48,8 @@ pub struct Actuators {
     efforts: BTreeMap<String, [f64; 2]>,
     /// True if an actuator has a controller inside.
     pub has_controllers: bool,
+    /// Position and velocity gain of each joint; `None` if its actuators are not one position controller.
+    gains: BTreeMap<String, Option<[f64; 2]>>,
 }
 
 impl Actuators {
@@ -66,6 +68,11 @@ impl Actuators {
     /// Returns the lowest and the highest force on a joint: the sum of its actuators. `None` if it has none.
     pub fn effort(&self, joint: &str) -> Option<[f64; 2]> {
         self.efforts.get(joint).copied()
+    }
+
+    /// Returns position and velocity gain of each joint that one position controller drives.
+    pub fn gains(&self) -> BTreeMap<String, [f64; 2]> {
+        self.gains.iter().filter_map(|(joint, gains)| Some((joint.clone(), (*gains)?))).collect()
     }
 
     /// Returns the names of the joints that have actuators.
@@ -90,6 +97,10 @@ impl Actuators {
         };
         let [gear, ..] = element.up_to::<6>("gear", "up to six numbers")?.unwrap_or([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
         let inner = self.force(element, tag, settings)?;
+        // The controller works with the length of the actuator, which is that of the joint times the gear.
+        let gains = position_gains(element, tag)?.map(|gains| gains.map(|gain| gain * gear * gear));
+        let is_first = !self.gains.contains_key(joint);
+        self.gains.insert(joint.to_owned(), gains.filter(|_| is_first));
         let [low, high] = match element.limits("forcerange", "forcelimited", settings)? {
             Some([low, high]) => [inner[0].clamp(low, high), inner[1].clamp(low, high)],
             None => inner,
@@ -137,4 +148,25 @@ impl Actuators {
         let scaled = control.map(|control| if gain == 0.0 { 0.0 } else { gain * control });
         Ok([scaled[0].min(scaled[1]), scaled[0].max(scaled[1])])
     }
+}
+
+/// Returns position and velocity gain of an actuator; `None` if it is no position controller, or if its damping follows from a ratio.
+fn position_gains(element: &Element, tag: &str) -> Result<Option<[f64; 2]>, RobotFileError> {
+    if element.number("dampratio", 0.0)? != 0.0 {
+        return Ok(None);
+    }
+    if tag == "position" {
+        return Ok(Some([element.number("kp", 1.0)?, element.number("kv", 0.0)?]));
+    }
+    let is = |name: &str, value: &str| element.attribute(name) == Some(value);
+    if tag != "general"
+        || !is("biastype", "affine")
+        || element.attribute("gaintype").is_some_and(|kind| kind != "fixed")
+    {
+        return Ok(None);
+    }
+    let first =
+        |name: &str| Ok::<_, RobotFileError>(element.up_to::<10>(name, "up to ten numbers")?.unwrap_or([0.0; 10]));
+    let ([gain, ..], [constant, position, velocity, ..]) = (first("gainprm")?, first("biasprm")?);
+    Ok((constant == 0.0 && gain > 0.0 && position == -gain).then_some([gain, -velocity]))
 }

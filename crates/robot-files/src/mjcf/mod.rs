@@ -3,7 +3,7 @@
 //! - [`defaults`]: default classes; [`element`]: an element with its class.
 //! - [`compiler`]: the settings of `<compiler>`.
 //! - [`worldbody`]: finds the robot; [`bodies`]: descends from its base through bodies and frames. [`joints`], [`geoms`], [`meshes`], [`actuators`],
-//!   [`pairs`]: what is in them.
+//!   [`pairs`]: what is in them. [`keyframe`]: the pose at the start.
 
 mod actuators;
 mod bodies;
@@ -12,6 +12,7 @@ mod defaults;
 mod element;
 mod geoms;
 mod joints;
+mod keyframe;
 mod meshes;
 mod pairs;
 mod worldbody;
@@ -22,7 +23,7 @@ pub use compiler::{MassSource, Settings};
 use roxmltree::Node;
 
 use crate::xml::{is_same, unsupported};
-use crate::{RobotFile, RobotFileError};
+use crate::{FileControl, RobotFile, RobotFileError};
 
 /// Sections that are read, and those that do not describe the robot.
 const SECTIONS: [&str; 12] = [
@@ -49,7 +50,9 @@ pub fn read<'a>(root: Node<'a, 'a>, folder: Option<&Path>) -> Result<RobotFile, 
     let actuators = actuators::Actuators::read(root, &classes)?;
     let meshes = meshes::Meshes::read(root, folder)?;
     let pairs = pairs::Pairs::read(root)?;
-    worldbody::read(root, &settings, &classes, &actuators, &meshes, &pairs)
+    let mut file = worldbody::read(root, &settings, &classes, &actuators, &meshes, &pairs)?;
+    file.control = FileControl { gains: actuators.gains(), home: keyframe::home(root, &file.tree) };
+    Ok(file)
 }
 
 /// Refuses sections that add forces or constraints, by the name of the first element.

@@ -51,8 +51,12 @@ pub fn read<'a>(
         ([robot], [_]) => reader.start(name, *robot, BaseMount::Floating)?,
         ([robot], []) if joints_of(robot.node).is_empty() => reader.start(name, *robot, BaseMount::Fixed)?,
         (_, [one]) => {
-            let problem =
-                format!("body `{}` moves freely, and others move beside it: one robot expected", label(one.node));
+            let beside = robots.iter().map(|place| label(place.node)).find(|name| *name != label(one.node));
+            let problem = format!(
+                "body `{}` moves freely, and `{}` moves beside it: one robot expected, and no actuators of anything else",
+                label(one.node),
+                beside.unwrap_or_default()
+            );
             return Err(unsupported(world, problem));
         }
         _ => {
