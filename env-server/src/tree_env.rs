@@ -1,6 +1,7 @@
 //! Environments of robots of any tree.
 
 use glam::{DAffine3, DQuat, Vec3};
+use twinstep_effects::{RobotSampler, TreeModelFile};
 use twinstep_envs::{ControlledRobot, Episode, NoisyEntry, Randomisation, StepOutcome, Task, add_noise};
 use twinstep_model::{
     AgentCommands, AutoresetMode, BackendError, BaseMount, EndedEpisode, EnvError, EnvSpec, GaitCommand, Ground,
@@ -22,6 +23,7 @@ pub struct TreeEnv<T: Task> {
     ground: Ground,
     simulation: TreeSimulation,
     randomise: Randomisation,
+    sampler: Option<RobotSampler<TreeModelFile>>,
     noise: Vec<NoisyEntry>,
     autoreset: AutoresetMode,
     episodes: Vec<Episode<T::State>>,
@@ -40,6 +42,8 @@ pub struct TreeEnvConfig {
     pub ground: Ground,
     /// Domain randomisation.
     pub randomise: Randomisation,
+    /// Samples the robot of each episode. Default: that of the model file.
+    pub sampler: Option<RobotSampler<TreeModelFile>>,
     /// When a new episode starts after one has ended.
     pub autoreset: AutoresetMode,
     /// Number of policy steps after which an episode is truncated. Default: that of the task.
@@ -65,6 +69,7 @@ impl<T: Task> TreeEnv<T> {
         let not_started = |env: u64| Episode::not_started(&task, settings.seed.wrapping_add(env));
         Self {
             randomise: settings.randomise,
+            sampler: settings.sampler,
             noise: settings.randomise.noise.entries(&spec),
             autoreset: settings.autoreset,
             episodes: (0..num_envs as u64).map(not_started).collect(),
@@ -99,8 +104,11 @@ impl<T: Task> TreeEnv<T> {
 
     /// Starts an episode of a robot at rest, and observes it.
     fn start(&mut self, env: usize) -> Result<(), EnvError> {
-        let Self { task, episodes, randomise, robot, simulation, ground, .. } = self;
-        let start = episodes[env].start(task, randomise, |_, random| randomise.sample_tree(robot, random));
+        let Self { task, episodes, randomise, sampler, robot, simulation, ground, .. } = self;
+        let start = episodes[env].start(task, randomise, |effects, random| {
+            let sampled = sampler.as_ref().map(|sampler| sampler.sample(effects));
+            randomise.sample_tree(sampled.as_ref().unwrap_or(robot), random).or(sampled)
+        });
         let q = start.q.into_iter().map(f64::from).collect();
         let model = start.robot.as_ref().unwrap_or(robot);
         let mut placement = Placement::standing_on(ground, robot, q);

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use twinstep_effects::{NominalGain, TreeModelFile};
+use twinstep_effects::{NominalGain, RobotSampler, TreeModelFile};
 use twinstep_envs::{ControlledRobot, PoseTask, Randomisation, Task, TaskConfig, Walk};
 use twinstep_model::{AutoresetMode, BaseMount, Feet, JOINT_NAMES, RobotTree, TreeModel, VecEnv, go2};
 use twinstep_protocol::random_u64;
@@ -25,6 +25,8 @@ const ACTION_SCALES: [f64; 2] = [0.1, 1.0];
 pub struct TreeEnvFactory {
     task: TaskConfig,
     randomise: Randomisation,
+    /// `None` unless the effects are sampled in each episode.
+    sampler: Option<RobotSampler<TreeModelFile>>,
     sim: SimConfig,
     robot: TreeModel,
     control: ControlledRobot,
@@ -46,12 +48,6 @@ impl TreeEnvFactory {
                 "a robot of any tree has no actuator networks; use 0",
             ));
         }
-        if config.randomise.effects {
-            return Err(refused(
-                "randomise.effects",
-                "the intervals of a robot of any tree are not sampled yet; use false",
-            ));
-        }
         let file = match &config.server.model {
             Some(path) => model(path)?,
             None => ideal_go2(),
@@ -65,7 +61,8 @@ impl TreeEnvFactory {
         if randomise.has_pushes() && control.standing_height.is_none() {
             return Err(refused("randomise.push_m_s", "the base of the robot is fixed; use [0, 0]"));
         }
-        let factory = Self { task, randomise, sim, robot, control, seed };
+        let sampler = if randomise.effects { Some(RobotSampler::new(file)?) } else { None };
+        let factory = Self { task, randomise, sampler, sim, robot, control, seed };
         factory.build(1, AutoresetMode::Disabled, None)?;
         Ok(factory)
     }
@@ -100,7 +97,8 @@ impl EnvFactory for TreeEnvFactory {
     ) -> Result<Box<dyn VecEnv>, EnvFactoryError> {
         let simulation = self.simulation(num_envs)?;
         let (ground, randomise, seed) = (self.sim.terrain.ground(), self.randomise, self.seed);
-        let settings = TreeEnvConfig { ground, randomise, autoreset, max_episode_steps, seed };
+        let sampler = self.sampler.clone();
+        let settings = TreeEnvConfig { ground, randomise, sampler, autoreset, max_episode_steps, seed };
         let control = self.control.clone();
         match &self.task {
             TaskConfig::Walk(config) => Ok(self.env(Walk::of(config.clone(), control, true)?, simulation, settings)),

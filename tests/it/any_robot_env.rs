@@ -227,6 +227,38 @@ fn robot_file_with_its_own_controllers_and_home_needs_no_model_file() {
 }
 
 #[test]
+fn intervals_of_a_model_file_are_sampled_in_each_episode() {
+    let folder = tempfile::tempdir().unwrap();
+    let model = folder.path().join("worn.toml");
+    let robot = root().join("data/robots/so101.xml");
+    let worn = |interval: &str| {
+        let text = format!(
+            "robot = {robot:?}\n[control]\nkp = 15.0\nkd = 0.6\n[[effect]]\nname = \"coulomb_friction\"\nscope = \"all\"\n\
+             torque_nm = 0.3\ninterval = {{ torque_nm = {interval} }}\n"
+        );
+        std::fs::write(&model, text).unwrap();
+        let mut config = pose_config("so101");
+        config.server.model = Some(model.clone());
+        config.randomise.effects = true;
+        config
+    };
+    let observe = |effects: bool| {
+        let mut config = worn("[0.05, 0.6]");
+        config.randomise.effects = effects;
+        let mut env = env(&config, 2, AutoresetMode::SameStep);
+        env.reset(&ResetRequest { seeds: Some(vec![5, 5]), ..ResetRequest::default() }).unwrap();
+        (0..5).for_each(|_| drop(env.step(&[0.5; 12]).unwrap().clone()));
+        env.obs().to_vec()
+    };
+    let (sampled, stated) = (observe(true), observe(false));
+    assert_eq!(sampled[..30], sampled[30..], "one seed is one robot");
+    let moved = sampled.iter().zip(&stated).map(|(one, other)| (one - other).abs()).fold(0.0, f32::max);
+    assert!(moved > 1e-4, "{moved}: the friction is not that of the file");
+    let error = TreeEnvFactory::new(&worn("[-3.0, 0.6]")).err().unwrap().to_string();
+    assert!(error.contains("`randomise.effects`: only") && error.contains("Coulomb friction of joint"), "{error}");
+}
+
+#[test]
 fn settings_that_a_tree_does_not_have_are_refused_by_name() {
     let error = |change: &dyn Fn(&mut Config)| {
         let mut config = pose_config("g1");
@@ -235,8 +267,6 @@ fn settings_that_a_tree_does_not_have_are_refused_by_name() {
     };
     let jump = error(&|config| config.task = TaskConfig::named("jump").unwrap());
     assert_eq!(jump, "`task.name`: a robot of any tree has the tasks `pose` and `walk`");
-    let effects = error(&|config| config.randomise.effects = true);
-    assert!(effects.contains("`randomise.effects`: the intervals of a robot of any tree"), "{effects}");
     let payload = error(&|config| config.randomise.payload_kg = [-20.0, 0.0]);
     assert!(payload.contains("`randomise.payload_kg`"), "{payload}");
     let terrain = error(&|config| {

@@ -1,8 +1,8 @@
 //! Domain randomisation: robots sampled from the intervals of a model file.
 
-use super::{EffectEntry, EntryError, apply_effects};
-use crate::ModelFile;
-use twinstep_model::{RobotModel, Stream, standard_normal, stream};
+use super::{EffectEntry, apply_effects};
+use crate::{Effect, ModelFile, TreeModelFile};
+use twinstep_model::{RobotModel, Stream, TreeModel, standard_normal, stream};
 
 /// Number of samples that estimate the fraction of valid robots.
 const TRIALS: usize = 100;
@@ -16,7 +16,16 @@ const CENTRAL: f64 = 1.96;
 /// rejected, for example if delays add up to more than [`twinstep_model::ActuatorParams::MAX_DELAY`] or a mass is not
 /// positive.
 #[derive(Clone, Debug, PartialEq)]
-pub struct RobotSampler(ModelFile);
+pub struct RobotSampler<F = ModelFile>(F);
+
+/// Model file with intervals.
+pub trait SampledFile {
+    /// What the file describes.
+    type Robot;
+
+    /// Samples a robot. Fails with the reason if it is not valid.
+    fn attempt(&self, random: &mut Stream) -> Result<Self::Robot, String>;
+}
 
 /// Less than half of the samples are valid robots.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -30,15 +39,15 @@ pub struct SamplingError {
     /// Number of samples that are valid robots.
     pub possible: usize,
     /// Reason why the first of the others is not valid.
-    pub cause: EntryError,
+    pub cause: String,
 }
 
-impl RobotSampler {
+impl<F: SampledFile> RobotSampler<F> {
     /// Creates the sampler of a model file. Fails if more than half of 100 samples are not valid robots.
-    pub fn new(file: ModelFile) -> Result<Self, SamplingError> {
+    pub fn new(file: F) -> Result<Self, SamplingError> {
         let this = Self(file);
         let mut trials = stream(0, "trial draws", 0);
-        let causes: Vec<_> = (0..TRIALS).filter_map(|_| this.attempt(&mut trials).err()).collect();
+        let causes: Vec<_> = (0..TRIALS).filter_map(|_| this.0.attempt(&mut trials).err()).collect();
         match causes.first() {
             Some(cause) if 2 * causes.len() > TRIALS => {
                 Err(SamplingError { tried: TRIALS, possible: TRIALS - causes.len(), cause: cause.clone() })
@@ -48,34 +57,53 @@ impl RobotSampler {
     }
 
     /// Samples a robot.
-    pub fn sample(&self, random: &mut Stream) -> RobotModel {
+    pub fn sample(&self, random: &mut Stream) -> F::Robot {
         // Terminates quickly: `new` checked that about half of all samples are valid.
         loop {
-            if let Ok(robot) = self.attempt(random) {
+            if let Ok(robot) = self.0.attempt(random) {
                 return robot;
             }
         }
     }
+}
 
-    fn attempt(&self, random: &mut Stream) -> Result<RobotModel, EntryError> {
-        let effects: Vec<_> = self.0.effects.iter().map(|entry| entry.sampled(random)).collect();
-        apply_effects(&self.0.nominal.model, &effects)
+impl SampledFile for ModelFile {
+    type Robot = RobotModel;
+
+    fn attempt(&self, random: &mut Stream) -> Result<RobotModel, String> {
+        let sampled = |entry: &EffectEntry| EffectEntry {
+            values: sampled(entry.effect, &entry.values, &entry.intervals, random),
+            ..entry.clone()
+        };
+        let effects: Vec<_> = self.effects.iter().map(sampled).collect();
+        apply_effects(&self.nominal.model, &effects).map_err(|error| error.to_string())
     }
 }
 
-impl EffectEntry {
-    fn sampled(&self, random: &mut Stream) -> EffectEntry {
-        let mut sampled = self.clone();
-        let parameters = self.effect.parameters.iter().flat_map(|one| std::iter::repeat_n(one, one.count));
-        for ((value, interval), parameter) in sampled.values.iter_mut().zip(&self.intervals).zip(parameters) {
-            if let Some([low, high]) = interval {
-                let [least, most] = parameter.bounds;
-                let std = (high - low) / (2.0 * CENTRAL);
-                *value = (0.5 * (low + high) + std * standard_normal(random)).clamp(least, most);
-            }
+impl SampledFile for TreeModelFile {
+    type Robot = TreeModel;
+
+    fn attempt(&self, random: &mut Stream) -> Result<TreeModel, String> {
+        let mut file = self.clone();
+        for entry in &mut file.effects {
+            entry.values = sampled(entry.effect, &entry.values, &entry.intervals, random);
         }
-        sampled
+        file.tree_model()
     }
+}
+
+/// Returns the values of an effect, those with an interval sampled from it.
+fn sampled(effect: &Effect, values: &[f64], intervals: &[Option<[f64; 2]>], random: &mut Stream) -> Vec<f64> {
+    let parameters = effect.parameters.iter().flat_map(|one| std::iter::repeat_n(one, one.count));
+    let mut values = values.to_vec();
+    for ((value, interval), parameter) in values.iter_mut().zip(intervals).zip(parameters) {
+        if let Some([low, high]) = interval {
+            let [least, most] = parameter.bounds;
+            let std = (high - low) / (2.0 * CENTRAL);
+            *value = (0.5 * (low + high) + std * standard_normal(random)).clamp(least, most);
+        }
+    }
+    values
 }
 
 #[cfg(test)]
@@ -141,7 +169,7 @@ mod tests {
     fn invalid_robots_are_rejected() {
         // The mean of each delay is 0.015 s: their sum sometimes exceeds 0.04 s.
         let (draws, mut random) = (draws(&delays(0.03)).expect("robots"), stream(1, "draws", 0));
-        assert!((0..200).any(|_| draws.attempt(&mut random).is_err()));
+        assert!((0..200).any(|_| draws.0.attempt(&mut random).is_err()));
         for _ in 0..200 {
             assert!(draws.sample(&mut random).joints[0].actuator.command_delay <= ActuatorParams::MAX_DELAY);
         }
