@@ -64,7 +64,9 @@ impl EnvFactory for AnyEnvFactory {
 ///
 /// A file with another mistake counts as one of a quadruped: whoever reads it says what is wrong.
 pub fn is_of_tree(model: &Path) -> bool {
-    match ModelFile::load(model) {
+    // Whoever reads the file for its robot says what it leaves out.
+    let silent = tracing::subscriber::NoSubscriber::default();
+    match tracing::subscriber::with_default(silent, || ModelFile::load(model)) {
         Err(ModelFileError::OfTree { .. }) => true,
         Err(ModelFileError::Robot { cause, .. }) => matches!(*cause, NominalRobotError::Import { .. }),
         _ => false,

@@ -6,7 +6,7 @@ use twinstep_effects::{NominalGain, RobotSampler, TreeModelFile};
 use twinstep_envs::{ControlledRobot, PoseTask, Randomisation, Task, TaskConfig, Walk};
 use twinstep_model::{AutoresetMode, BaseMount, Feet, JOINT_NAMES, RobotTree, TreeModel, VecEnv, go2};
 use twinstep_protocol::random_u64;
-use twinstep_sim::{BackendBuildError, Placement, SimConfig, TreeSimulation};
+use twinstep_sim::{BackendBuildError, Engine, Placement, SimConfig, TreeSimulation};
 
 use crate::tree_env::{TreeEnv, TreeEnvConfig};
 use crate::{Config, EnvFactory, EnvFactoryError};
@@ -57,7 +57,13 @@ impl TreeEnvFactory {
         let seed = config.server.seed.unwrap_or_else(random_u64);
         let (task, randomise, sim) = (config.task.clone(), config.randomise, config.sim);
         randomise.check()?;
-        randomise.check_base(robot.tree.bodies[0].inertia.mass)?;
+        if control.standing_height.is_some() {
+            randomise.check_base(robot.tree.bodies[0].inertia.mass)?;
+        }
+        if sim.engine == Engine::Mujoco && randomise.command_delay_ms != [0.0, 0.0] {
+            let reason = "the engine `mujoco` has no delay for a robot of any tree; use [0, 0], or `batch`";
+            return Err(refused("randomise.command_delay_ms", reason));
+        }
         if randomise.has_pushes() && control.standing_height.is_none() {
             return Err(refused("randomise.push_m_s", "the base of the robot is fixed; use [0, 0]"));
         }
@@ -155,12 +161,16 @@ fn controlled_robot(
 ) -> Result<ControlledRobot, EnvFactoryError> {
     let joints: Vec<String> = robot.tree.joints.iter().map(|joint| joint.name.clone()).collect();
     let of_robot_file = &file.of_robot_file.gains;
-    let gain = |(index, key): (usize, &'static str), gains: &Option<NominalGain>, joint: &str| {
-        let stated = gains.as_ref().and_then(|gains| gains.of(joint));
-        let missing = || EnvFactoryError::NoGain { key, joint: joint.to_owned() };
-        stated.or_else(|| Some(of_robot_file.get(joint)?[index])).ok_or_else(missing)
+    let gain = |joint: usize, part: usize| {
+        let (key, gains) = [("kp", &file.kp), ("kd", &file.kd)][part];
+        let name = &joints[joint];
+        let stated = gains.as_ref().and_then(|gains| gains.of(name));
+        // Gains of a joint without actuator have no effect.
+        let passive = (robot.joints[joint].torque_limit == 0.0).then_some(0.0);
+        let missing = || EnvFactoryError::NoGain { key, joint: name.clone() };
+        stated.or_else(|| Some(of_robot_file.get(name)?[part])).or(passive).ok_or_else(missing)
     };
-    let gains = joints.iter().map(|joint| Ok([gain((0, "kp"), &file.kp, joint)?, gain((1, "kd"), &file.kd, joint)?]));
+    let gains = (0..joints.len()).map(|joint| Ok([gain(joint, 0)?, gain(joint, 1)?]));
     let gains = gains.collect::<Result<Vec<_>, EnvFactoryError>>()?;
     let (actuator_hz, policy_hz) = (file.actuator_hz.unwrap_or(ACTUATOR_HZ), file.policy_hz.unwrap_or(POLICY_HZ));
     let decimation = (actuator_hz / policy_hz).round().max(1.0);

@@ -4,6 +4,7 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use twinstep_effects::is_robot_file;
+use twinstep_env_server::is_of_tree;
 use twinstep_model::{BaseMount, MjcfOptions, RobotTree, go2, mjcf};
 use twinstep_robot_files::{QuadrupedNames, TreeMjcf, quadruped, read_robot, write_mjcf};
 use twinstep_sim::effect_outside_mujoco;
@@ -81,11 +82,10 @@ pub fn run(args: &Args) -> CommandResult {
 
 /// Returns the model of a model file; as a tree if it is no quadruped like the Go2.
 fn of_model_file(path: Option<&Path>, options: &MjcfOptions) -> Result<String, Failure> {
-    let refused = match robot_model(path) {
-        Ok(robot) => return Ok(mjcf(&robot, options)),
-        Err(refused) => refused,
-    };
-    let robot = of_any_tree(path).ok().and_then(|file| file.tree_model().ok()).ok_or(refused)?;
+    if !path.is_some_and(is_of_tree) {
+        return Ok(mjcf(&robot_model(path)?, options));
+    }
+    let robot = of_any_tree(path)?.tree_model().expect("the file was checked when it was read");
     if let Some(effect) = effect_outside_mujoco(&robot.joints) {
         eprintln!("note: `{effect}` of the model file is left out, because MuJoCo has no such joint");
     }

@@ -24,7 +24,7 @@ use crate::web_view::{ViewArgs, WatchedFactory};
 /// Interval at which the server checks for signals.
 const TICK: Duration = Duration::from_millis(50);
 
-/// Serve simulated robots over Zenoh: the Go2, quadrupeds like it, and with `--task pose` any arm, quadruped or humanoid.
+/// Serve simulated robots over Zenoh: the Go2, quadrupeds like it, and with the tasks `walk` and `pose` any robot.
 ///
 /// Agents lease environments and call `reset` and `step`: from Rust (`twinstep-client`), from Python (`twinstep`) or,
 /// as `protocol/SPEC.md` specifies, from any language with a Zenoh client. Default: it listens on this machine only.

@@ -143,7 +143,7 @@ fn hips(robot: &TreeModel, feet: &Feet, pose: &[f64]) -> Vec<usize> {
 
 fn link(robot: &TreeModel, name: &str) -> Result<usize, ConfigError> {
     let names = || robot.tree.bodies.iter().map(|body| body.name.as_str()).collect::<Vec<_>>().join(", ");
-    robot.tree.bodies.iter().position(|body| body.name == name).ok_or_else(|| ConfigError {
+    robot.tree.link(name).ok_or_else(|| ConfigError {
         field: "groups.foot".to_owned(),
         value: name.to_owned(),
         allowed: format!("a link of the robot: {}", names()),

@@ -141,6 +141,12 @@ impl RobotTree {
         self.bodies.iter().map(|body| body.inertia.mass).sum()
     }
 
+    /// Returns the index of the body of the link with this name: of the bodies of a link with several joints, the one that has its mass and
+    /// shapes.
+    pub fn link(&self, name: &str) -> Option<usize> {
+        self.bodies.iter().rposition(|body| body.name == name)
+    }
+
     /// Returns the index of the joint with this name.
     pub fn joint(&self, name: &str) -> Option<usize> {
         self.joints.iter().position(|joint| joint.name == name)

@@ -88,6 +88,12 @@ impl Writer<'_> {
         !self.is_free() && tree.bodies[0].inertia.mass == 0.0 && tree.world_from_base == DAffine3::IDENTITY
     }
 
+    /// Returns the name of the base, which is that of no joint, because bodies have the names of joints.
+    fn base_name(&self) -> String {
+        let name = &self.tree.bodies[0].name;
+        if self.tree.joint(name).is_some() { format!("{name}_base") } else { name.clone() }
+    }
+
     /// Writes a body and those below it. `offset` is the origin of the parent of the tree in the body that was written for it [m].
     fn body(&mut self, index: usize, offset: DVec3, depth: usize) {
         let joint = index.checked_sub(1).map(|joint| &self.tree.joints[joint]);
@@ -98,7 +104,8 @@ impl Writer<'_> {
                 DAffine3::from_translation(offset) * joint.parent_from_child
             });
             // The name of the joint, because a body of the file may be several bodies of the tree.
-            let name = escaped(joint.map_or(&self.tree.bodies[0].name, |joint| &joint.name));
+            let name = joint.map_or_else(|| self.base_name(), |joint| joint.name.clone());
+            let name = escaped(&name);
             self.line(depth, &format!("<body name=\"{name}\"{}>", placed(pose)));
         }
         if index == 0 && self.is_free() {

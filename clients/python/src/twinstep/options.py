@@ -72,7 +72,7 @@ def server_flags(options: ConnectOptions) -> tuple[str, ...]:
     if options.config is not None:
         flags += ["--config", options.config]
     model = options.robot if options.model is None else options.model
-    if model is not None and model != "go2":
+    if model is not None:
         flags += ["--model", model]
     if options.shared_memory:
         flags.append("--shared-memory")

@@ -34,8 +34,8 @@ pub enum ModelFileError {
     },
     /// The file describes a robot of any tree, and the caller needs a quadruped like the Go2.
     #[error(
-        "{name}: this is the model file of a robot of any tree: it has [joints.rename], or gains or a pose by joint. `evaluate`, \
-         `identify` and `serve --task pose` take it; other commands need a quadruped like the Go2"
+        "{name}: this is the model file of a robot of any tree: it has [joints.rename], [groups], [shapes], or gains or a \
+         pose by joint. `serve` and `train` with the tasks `walk` and `pose`, `evaluate` and `identify` take it; this needs a quadruped like the Go2"
     )]
     OfTree {
         /// The file, or another source of the text.

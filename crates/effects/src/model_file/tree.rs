@@ -262,8 +262,14 @@ impl TreeModelFile {
 
     fn check_groups(&self, groups: &TreeGroups) -> Result<(), String> {
         let tree = &self.nominal.tree;
+        for (key, names) in [("foot", &groups.foot), ("hip", &groups.hip)] {
+            let mut seen = BTreeSet::new();
+            if let Some(twice) = names.iter().flatten().find(|name| !seen.insert(*name)) {
+                return Err(format!("`groups.{key}`: `{twice}` is there twice"));
+            }
+        }
         let mut feet = groups.foot.iter().flatten();
-        if let Some(foot) = feet.find(|foot| !tree.bodies.iter().any(|body| body.name == **foot)) {
+        if let Some(foot) = feet.find(|foot| tree.link(foot).is_none()) {
             let links: Vec<_> = tree.bodies.iter().map(|body| body.name.as_str()).collect();
             return Err(format!("`groups.foot`: the robot has no link `{foot}`; its links are {}", links.join(", ")));
         }
@@ -480,6 +486,8 @@ mod tests {
         assert!(error.contains("`control.default_pose.elbow_flex` is 3; -1.69 to 1.69 expected"), "{error}");
         let error = refusal("[groups]\nfoot = [\"toe\"]\n");
         assert!(error.contains("`groups.foot`: the robot has no link `toe`; its links are base"), "{error}");
+        let error = refusal("[groups]\nhip = [\"gripper\", \"gripper\"]\n");
+        assert!(error.contains("`groups.hip`: `gripper` is there twice"), "{error}");
         let error = refusal("[groups]\nhip = [\"toe\"]\n");
         assert!(error.contains("`groups.hip`: the robot has no joint `toe`; its joints are"), "{error}");
         let error = refusal("[[effect]]\nname = \"payload\"\nscope = \"base\"\nmass_kg = 1\nposition_m = [0, 0, 0]\n");

@@ -59,7 +59,7 @@ pub fn with_shapes(robot: TreeModel, shapes: &BTreeMap<String, Vec<ShapeText>>) 
     }
     let mut tree = robot.tree.clone();
     for (link, given) in shapes {
-        let body = tree.bodies.iter().position(|body| body.name == *link).ok_or_else(|| {
+        let body = tree.link(link).ok_or_else(|| {
             let links: Vec<_> = tree.bodies.iter().map(|body| body.name.as_str()).collect();
             format!("`shapes`: the robot has no link `{link}`; its links are {}", links.join(", "))
         })?;
@@ -99,6 +99,15 @@ mod tests {
         // The capsule lies along x.
         assert!((robot.points[8].centre.x.abs() - 0.1).abs() < 1e-12, "{:?}", robot.points[8]);
         assert_eq!((robot.points[10].body, robot.points[10].radius), (3, 0.02));
+    }
+
+    #[test]
+    fn link_with_several_joints_has_its_shapes_at_the_last() {
+        let mut tree = RobotTree::from(&go2());
+        "FL_calf".clone_into(&mut tree.bodies[2].name);
+        let shapes: BTreeMap<String, Vec<ShapeText>> = toml::from_str("FL_calf = [{ sphere = 0.1 }]").expect("valid");
+        let robot = with_shapes(TreeModel::new(tree).expect("equal limits"), &shapes).expect("a link");
+        assert_eq!(robot.tree.shapes[0].body, 3);
     }
 
     #[test]

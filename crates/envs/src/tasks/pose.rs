@@ -8,7 +8,7 @@ use twinstep_model::{EnvSpec, Stream, frames};
 use super::pose_config::PoseConfig;
 use crate::ControlledRobot;
 use crate::config::ConfigError;
-use crate::observation::{field, spec_of};
+use crate::observation::{base_height, field, spec_of};
 use crate::task::{RobotView, Step, Task};
 
 /// Names of the reward terms.
@@ -60,7 +60,7 @@ impl PoseTask {
         let Some(standing) = self.robot.standing_height else { return false };
         let is_tilted = -frames::projected_gravity(robot.orientation).z < self.config.max_tilt_rad.cos();
         let lowest = f64::from(self.config.min_height) * standing;
-        is_tilted || robot.truth.is_some_and(|truth| f64::from(truth.base_position[2]) < lowest)
+        is_tilted || robot.truth.is_some_and(|truth| f64::from(base_height(robot, &truth)) < lowest)
     }
 }
 

@@ -152,21 +152,25 @@ impl Actuators {
 
 /// Returns position and velocity gain of an actuator; `None` if it is no position controller, or if its damping follows from a ratio.
 fn position_gains(element: &Element, tag: &str) -> Result<Option<[f64; 2]>, RobotFileError> {
-    if element.number("dampratio", 0.0)? != 0.0 {
-        return Ok(None);
-    }
+    let first = |name: &str| element.up_to::<10>(name, "up to ten numbers");
+    // Shortcuts write their gains into these, so that their defaults are those of one actuator.
+    let gain = first("gainprm")?.map(|[gain, ..]| gain);
+    let [constant, position, velocity, ..] = first("biasprm")?.unwrap_or([0.0; 10]);
     if tag == "position" {
-        return Ok(Some([element.number("kp", 1.0)?, element.number("kv", 0.0)?]));
+        let [kp, kv] = [element.number("kp", gain.unwrap_or(1.0))?, element.number("kv", -velocity)?];
+        for (name, value) in [("kp", kp), ("kv", kv)] {
+            if value < 0.0 && element.attribute(name).is_some() {
+                return Err(element.error(name, "0 or more"));
+            }
+        }
+        let has_ratio = element.number("dampratio", 0.0)? != 0.0 || kv < 0.0;
+        return Ok((!has_ratio).then_some([kp, kv]));
     }
-    let is = |name: &str, value: &str| element.attribute(name) == Some(value);
-    if tag != "general"
-        || !is("biastype", "affine")
-        || element.attribute("gaintype").is_some_and(|kind| kind != "fixed")
-    {
+    let is_fixed = element.attribute("gaintype").is_none_or(|kind| kind == "fixed");
+    if tag != "general" || element.attribute("biastype") != Some("affine") || !is_fixed {
         return Ok(None);
     }
-    let first =
-        |name: &str| Ok::<_, RobotFileError>(element.up_to::<10>(name, "up to ten numbers")?.unwrap_or([0.0; 10]));
-    let ([gain, ..], [constant, position, velocity, ..]) = (first("gainprm")?, first("biasprm")?);
-    Ok((constant == 0.0 && gain > 0.0 && position == -gain).then_some([gain, -velocity]))
+    // A positive number is a ratio of the critical damping.
+    let is_controller = gain.is_some_and(|gain| gain > 0.0 && position == -gain) && constant == 0.0 && velocity <= 0.0;
+    Ok(gain.filter(|_| is_controller).map(|gain| [gain, -velocity]))
 }

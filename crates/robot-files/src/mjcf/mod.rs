@@ -17,6 +17,7 @@ mod meshes;
 mod pairs;
 mod worldbody;
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
 pub use compiler::{MassSource, Settings};
@@ -51,7 +52,11 @@ pub fn read<'a>(root: Node<'a, 'a>, folder: Option<&Path>) -> Result<RobotFile, 
     let meshes = meshes::Meshes::read(root, folder)?;
     let pairs = pairs::Pairs::read(root)?;
     let mut file = worldbody::read(root, &settings, &classes, &actuators, &meshes, &pairs)?;
-    file.control = FileControl { gains: actuators.gains(), home: keyframe::home(root, &file.tree) };
+    let home = keyframe::home(root).unwrap_or_else(|note| {
+        file.notes.push(note);
+        BTreeMap::new()
+    });
+    file.control = FileControl { gains: actuators.gains(), home };
     Ok(file)
 }
 

@@ -85,7 +85,7 @@ pub fn read<'a>(
         reader.tree.set_total_mass(total);
     }
     if actuators.has_controllers {
-        reader.tree.note("controllers inside the actuators of the file are left out: their force limits are kept");
+        reader.tree.note("controllers inside the actuators of the file are left out: their force limits and their gains, as defaults, are kept");
     }
     reader.tree.finish()
 }
