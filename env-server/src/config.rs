@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
-use twinstep_effects::ControlTable;
+use twinstep_effects::{ControlTable, parse_toml};
 use twinstep_envs::{Randomisation, TaskConfig};
 use twinstep_sim::SimConfig;
 
@@ -147,7 +147,7 @@ impl Config {
 
     /// Parses the text of a config file. Errors refer to the file as `name`.
     pub fn parse(text: &str, name: &str) -> Result<Self, ConfigFileError> {
-        let config: Self = toml::from_str(text)
+        let config: Self = parse_toml(text)
             .map_err(|error| ConfigFileError::Malformed { name: name.to_owned(), message: error.to_string() })?;
         config.check()?;
         Ok(config)

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use serde::Deserialize;
-use twinstep_effects::{ControlTable, JointGains};
+use twinstep_effects::{ControlTable, JointGains, parse_toml};
 use twinstep_model::{EnvSpec, JOINT_NAMES, NUM_JOINTS};
 use twinstep_policy::Policy;
 
@@ -38,9 +38,9 @@ pub fn read_contract(path: impl AsRef<Path>) -> Result<ControlTable, AgentError>
         }
         "toml" => {
             let text = std::fs::read_to_string(path).map_err(|error| failed(error.to_string()))?;
-            let table: toml::Table = text.parse().map_err(|error: toml::de::Error| failed(error.to_string()))?;
+            let table: toml::Table = parse_toml(&text).map_err(|error| failed(error.to_string()))?;
             if table.contains_key("control") {
-                let file: WithControl = toml::from_str(&text).map_err(|error| failed(error.to_string()))?;
+                let file: WithControl = parse_toml(&text).map_err(|error| failed(error.to_string()))?;
                 return Ok(file.control);
             }
             contract_of_mapping(&Mapping::parse(&text).map_err(failed)?).map_err(failed)

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::path::Path;
+use twinstep_effects::parse_toml;
 
 use serde::Deserialize;
 
@@ -236,7 +237,7 @@ impl Mapping {
 
     /// Parses and checks the text of a mapping file. The error says what is wrong.
     pub fn parse(text: &str) -> Result<Self, String> {
-        let mapping: Self = toml::from_str(text).map_err(|error| error.to_string().trim_end().to_owned())?;
+        let mapping: Self = parse_toml(text).map_err(|error| error.to_string().trim_end().to_owned())?;
         mapping.check()?;
         Ok(mapping)
     }

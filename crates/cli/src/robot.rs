@@ -8,7 +8,7 @@ use std::time::Duration;
 use rustix::mm::MlockAllFlags;
 use serde::Deserialize;
 use twinstep_agent::read_contract;
-use twinstep_effects::{ControlTable, ModelFile};
+use twinstep_effects::{ControlTable, ModelFile, parse_toml};
 use twinstep_env_server::{Server, ServerConfig, ServerError, check_measurable};
 use twinstep_envs::TaskConfig;
 use twinstep_model::{PerJoint, RobotModel};
@@ -112,7 +112,7 @@ impl RobotConfig {
             Some(path) => {
                 let content = std::fs::read_to_string(path)
                     .map_err(|error| text(&format!("cannot read the config file {}: {error}", path.display())))?;
-                toml::from_str(&content).map_err(|error| text(&format!("{}: {error}", path.display())))?
+                parse_toml(&content).map_err(|error| text(&format!("{}: {error}", path.display())))?
             }
             None => Self::default(),
         };

@@ -1,6 +1,7 @@
 //! Config file of `twinstep spi-active`, and the arguments of the commands of its stages.
 
 use std::path::{Path, PathBuf};
+use twinstep_effects::parse_toml;
 
 use serde::{Deserialize, Serialize};
 use twinstep_excite::{Criterion, Limits};
@@ -131,7 +132,7 @@ impl SpiActiveConfig {
     pub fn load(path: &Path) -> Result<Self, Failure> {
         let wrong = |cause: String| Failure::Input(miette::miette!("{}: {cause}", path.display()));
         let text = std::fs::read_to_string(path).map_err(|error| wrong(error.to_string()))?;
-        let config: Self = toml::from_str(&text).map_err(|error| wrong(error.to_string()))?;
+        let config: Self = parse_toml(&text).map_err(|error| wrong(error.to_string()))?;
         config.check().map_err(wrong)?;
         Policy::read(&config.policy).map_err(input)?;
         let model = analytic_model(config.model.as_deref())?;

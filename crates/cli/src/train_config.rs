@@ -1,6 +1,7 @@
 //! Config file of `twinstep train`, and the environments that it describes.
 
 use std::path::{Path, PathBuf};
+use twinstep_effects::parse_toml;
 
 use serde::{Deserialize, Serialize};
 use twinstep_env_server::{
@@ -68,7 +69,7 @@ impl TrainConfig {
 
     /// Parses the text of a config file. Errors refer to the file as `name`.
     pub fn parse(text: &str, name: &str) -> Result<Self, Failure> {
-        toml::from_str(text)
+        parse_toml(text)
             .map_err(|error| input(ConfigFileError::Malformed { name: name.to_owned(), message: error.to_string() }))
     }
 

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize};
-use twinstep_effects::{ActuatorNetworkConfig, MemberSampling, ModelFile};
+use twinstep_effects::{ActuatorNetworkConfig, MemberSampling, ModelFile, parse_toml};
 use twinstep_ensemble::check_effects;
 use twinstep_envs::{ExploreConfig, Randomisation, TaskConfig, over_defaults};
 use twinstep_excite::Limits;
@@ -189,7 +189,7 @@ impl U2eConfig {
     pub fn load(path: &Path) -> Result<Self, Failure> {
         let wrong = |cause: String| Failure::Input(miette::miette!("{}: {cause}", path.display()));
         let text = std::fs::read_to_string(path).map_err(|error| wrong(error.to_string()))?;
-        let mut config: Self = toml::from_str(&text).map_err(|error| wrong(error.to_string()))?;
+        let mut config: Self = parse_toml(&text).map_err(|error| wrong(error.to_string()))?;
         if !config.explore.base.as_os_str().is_empty() {
             return Err(wrong("`explore.base` is not a setting here: the base policy is `policy`".to_owned()));
         }

@@ -18,6 +18,7 @@ pub mod demo;
 mod entry;
 mod model_file;
 mod nominal;
+mod parse_toml;
 mod sampler;
 mod scope;
 mod search;
@@ -32,6 +33,7 @@ pub use model_file::{
     NetworkMode, NominalGain, ShapeText, TreeGroups, TreeModelFile, load_robot, parse_robot,
 };
 pub use nominal::{ControlTable, JointGains, JointsTable, KindGains, NominalRobot, NominalRobotError, is_robot_file};
+pub use parse_toml::parse_toml;
 pub use sampler::{RobotSampler, SamplingError};
 pub use scope::{Scope, UnknownScope};
 pub use search::{BlindTestCondition, Probes, Search, Variable, Visibility};

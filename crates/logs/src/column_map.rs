@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::path::Path;
+use twinstep_effects::parse_toml;
 
 use serde::Deserialize;
 
@@ -79,7 +80,7 @@ impl ColumnMap {
 
     /// Parses and checks the text of a map. The error says what is wrong.
     pub fn parse(text: &str) -> Result<Self, String> {
-        let map: Self = toml::from_str(text).map_err(|error| error.to_string().trim_end().to_owned())?;
+        let map: Self = parse_toml(text).map_err(|error| error.to_string().trim_end().to_owned())?;
         for (key, source) in &map.columns {
             let Source::Converted(conversion) = source else { continue };
             if let Some(unit) = conversion.unit.as_ref().filter(|unit| !UNITS.iter().any(|(name, _)| name == unit)) {

@@ -25,6 +25,31 @@ pub fn compressed(bytes: &[u8]) -> Vec<u8> {
     written.expect("a Vec takes all bytes")
 }
 
+/// A robot with controllers and a keyframe, beside an object.
+const SCENE: &str = r#"<mujoco><worldbody><geom name="floor" type="plane" size="0 0 1"/>
+<body name="base"><joint type="free" armature="0.1" damping="0.2" frictionloss="0.1"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>
+<body name="leg"><joint name="hip"/><joint name="knee" axis="0 1 0"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>
+<geom name="foot" size="0.1" contype="0" conaffinity="0"/></body></body>
+<body name="ball"><freejoint/><geom size="0.1" mass="1"/></body></worldbody>
+<contact><pair geom1="foot" geom2="floor"/></contact>
+<actuator><position joint="hip" kp="20" kv="1"/><general joint="knee" biastype="affine" gainprm="9" biasprm="0 -9 -1"/></actuator>
+<keyframe><key name="home" qpos="0 0 1 1 0 0 0 0.1 0.2 1 1 1 1 0 0 0"/></keyframe></mujoco>"#;
+
+/// Model file of a robot of any tree with every table.
+const TREE: &str = r#"robot = "go2"
+[control]
+kp = { hip = 20.0 }
+kd = 0.5
+[joints.rename]
+FL_hip = "hip"
+[groups]
+foot = ["FL_calf", "RR_calf"]
+hip = ["hip"]
+[shapes]
+FL_calf = [{ sphere = 0.02, at = [0.0, 0.0, -0.2] }, { box = [0.1, 0.1, 0.1], rpy = [0.1, 0.2, 0.3] }]
+trunk = [{ capsule = [0.05, 0.2] }]
+"#;
+
 /// Returns the examples of a text format.
 pub fn text_examples(format: Format) -> Vec<Vec<u8>> {
     match format {
@@ -32,7 +57,7 @@ pub fn text_examples(format: Format) -> Vec<Vec<u8>> {
         Format::Urdf => examples_in("data/robots", "", ".urdf"),
         Format::Mjcf => {
             let exported = mjcf(&go2(), &MjcfOptions::default()).into_bytes();
-            [examples_in("data/robots", "", ".xml"), vec![exported]].concat()
+            [examples_in("data/robots", "", ".xml"), vec![exported, SCENE.into()]].concat()
         }
         Format::Config => {
             let default = toml::to_string(&Config::default()).expect("a config is plain data");
@@ -128,7 +153,7 @@ fn model_files() -> Vec<Vec<u8>> {
     let actuator = "robot = \"go2\"\n\n[control]\nkp = 25.0\npolicy_hz = 100.0\n\n[actuator]\n\
                     ensemble = \"actuators.safetensors\"\ndraw = \"step\"\nsample = true\n";
     let mut files = examples_in("data/robots", "", ".toml");
-    files.extend([all.to_toml().into_bytes(), actuator.into()]);
+    files.extend([all.to_toml().into_bytes(), actuator.into(), TREE.into()]);
     files
 }
 

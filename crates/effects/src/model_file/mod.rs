@@ -27,6 +27,7 @@ pub use tree_shapes::ShapeText;
 pub use tree_text::{NominalGain, TreeGroups};
 
 use crate::nominal::{ControlTable, JointsTable, NominalRobot, NominalRobotError, is_robot_file};
+use crate::parse_toml;
 use crate::shipped_robots::{read_to_string, resolved};
 use crate::{EffectEntry, EntryError, apply_effects};
 use actuator_network::write_actuator_network;
@@ -94,7 +95,7 @@ impl ModelFile {
         if TreeModelFile::is_meant(text) {
             return Err(ModelFileError::OfTree { name: name.to_owned() });
         }
-        let ModelText { robot, control, joints, effect, actuator } = toml::from_str(text)
+        let ModelText { robot, control, joints, effect, actuator } = parse_toml(text)
             .map_err(|error| ModelFileError::Malformed { name: name.to_owned(), message: error.to_string() })?;
         let nominal = NominalRobot::read(&robot, control, joints, folder)
             .map_err(|cause| ModelFileError::Robot { name: name.to_owned(), cause: Box::new(cause) })?;

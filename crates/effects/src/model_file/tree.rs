@@ -14,7 +14,7 @@ use super::tree_shapes::{ShapeText, with_shapes};
 use super::tree_text::{Control, Joints, NominalGain, Pose, TreeGroups, TreeText};
 use crate::nominal::{BUILT_IN, JointsTable, NominalRobotError, is_robot_file};
 use crate::shipped_robots::{read_to_string, resolved};
-use crate::{Apply, CATALOGUE, Effect};
+use crate::{Apply, CATALOGUE, Effect, parse_toml};
 
 /// A robot of any tree, and the effects at its joints.
 #[derive(Clone, Debug, PartialEq)]
@@ -109,7 +109,7 @@ impl TreeModelFile {
 
     /// Returns true if a text has keys that only the model file of a tree has: names of joints, or gains by joint.
     pub fn is_meant(text: &str) -> bool {
-        let Ok(table) = text.parse::<Table>() else { return false };
+        let Ok(table) = parse_toml::<Table>(text) else { return false };
         let is_table =
             |name: &str, key: &str| table.get(name).and_then(|table| table.get(key)).is_some_and(Value::is_table);
         ["groups", "shapes"].iter().any(|key| table.contains_key(*key))
@@ -136,7 +136,7 @@ impl TreeModelFile {
     fn parse_in(folder: &Path, text: &str, name: &str) -> Result<Self, ModelFileError> {
         let malformed = |message: String| ModelFileError::Malformed { name: name.to_owned(), message };
         let TreeText { robot, control, joints, groups, shapes, effect } =
-            toml::from_str(text).map_err(|error| malformed(error.to_string()))?;
+            parse_toml(text).map_err(|error| malformed(error.to_string()))?;
         let mut file = if robot == BUILT_IN { Self::go2() } else { Self::read_robot_file(&robot, folder, name)? };
         file.rename_joints(joints.rename).map_err(malformed)?;
         let Control { kp, kd, actuator_hz, policy_hz, action_scale, default_pose } = control;
