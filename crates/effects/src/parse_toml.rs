@@ -38,7 +38,7 @@ mod tests {
             assert!(parse_toml::<Table>(&text(count)).is_err());
         }
         let error = parse_toml::<Table>(&text(5000)).expect_err("too many").to_string();
-        assert_eq!(error.trim_end(), "5000 brackets are open at once; at most 100 are expected");
+        assert_eq!(error.trim_end(), "5001 brackets are open at once; at most 100 are expected");
         assert!(parse_toml::<Table>("a = [[1, { b = [2] }]]\n[c]\n").is_ok());
     }
 }
