@@ -4,7 +4,7 @@ use std::io::Write;
 use std::path::Path;
 
 use twinstep_effects::{
-    CATALOGUE, Effect, EffectEntry, ModelFile, ModelFileError, RobotSampler, Scope, Target, TreeModelFile,
+    CATALOGUE, Effect, EffectEntry, ModelFile, ModelFileError, RobotSampler, Scope, Target, TreeModelFile, parse_toml,
 };
 use twinstep_ensemble::{ActuatorNetworkRobot, Checkpoint, Ensemble, Inference};
 use twinstep_env_server::{Config, ConfigFileError, SimEnvFactory};
@@ -276,7 +276,7 @@ fn read_model(path: &Path, text: &str) -> Outcome {
         Err(ModelFileError::OfTree { .. }) => read_tree_model(path),
         Err(error) => {
             assert!(!error.to_string().is_empty(), "an error has a text");
-            if text.parse::<toml::Table>().is_ok() { Outcome::Decoded } else { Outcome::Refused }
+            if parse_toml::<toml::Table>(text).is_ok() { Outcome::Decoded } else { Outcome::Refused }
         }
     }
 }

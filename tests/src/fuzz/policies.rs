@@ -118,7 +118,7 @@ pub fn read(format: Format, bytes: &[u8], path: &Path) -> Outcome {
         Format::Onnx => read_onnx(path),
         Format::Mapping => match std::str::from_utf8(bytes).map(|text| (text, Mapping::parse(text))) {
             Ok((_, Ok(mapping))) => Outcome::checked(mapping.input_len() > 0),
-            Ok((text, Err(_))) if text.parse::<toml::Table>().is_ok() => Outcome::Decoded,
+            Ok((text, Err(_))) if twinstep_effects::parse_toml::<toml::Table>(text).is_ok() => Outcome::Decoded,
             _ => Outcome::Refused,
         },
         Format::LowState => match decode::<LowState>(bytes) {
