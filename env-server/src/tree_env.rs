@@ -88,15 +88,7 @@ impl<T: Task> TreeEnv<T> {
     }
 
     fn check_actions(&self, actions: &[f32]) -> Result<(), EnvError> {
-        let action_len = self.spec.action_len();
-        let expected = self.num_envs() * action_len;
-        if actions.len() != expected {
-            return Err(EnvError::WrongLength { field: "actions", given: actions.len(), expected });
-        }
-        if let Some(index) = actions.iter().position(|value| !value.is_finite()) {
-            let entry = self.spec.action_entry(index % action_len);
-            return Err(EnvError::ActionNotFinite { env: index / action_len, entry, value: actions[index] });
-        }
+        self.spec.check_actions(actions, self.num_envs())?;
         let restarts = self.autoreset != AutoresetMode::Disabled;
         let needs_reset = |episode: &Episode<T::State>| !episode.running && (!restarts || !episode.was_started());
         self.episodes.iter().position(needs_reset).map_or(Ok(()), |env| Err(EnvError::NeedsReset { env }))
@@ -114,7 +106,7 @@ impl<T: Task> TreeEnv<T> {
         let mut placement = Placement::standing_on(ground, robot, q);
         placement.base_position[2] += if self.control.standing_height.is_some() { START_CLEARANCE } else { 0.0 };
         simulation.reset(env, model, &placement).map_err(failed)?;
-        set_commands(task, &self.agent_commands, env, &mut episodes[env].state);
+        episodes[env].set_commands(task, &self.agent_commands, env);
         self.observe(env);
         Ok(())
     }
@@ -243,7 +235,7 @@ impl<T: Task> VecEnv for TreeEnv<T> {
         let commands = std::mem::take(&mut self.next_agent_commands);
         self.check_actions(actions)?;
         for (env, episode) in self.episodes.iter_mut().enumerate() {
-            set_commands(&self.task, &commands, env, &mut episode.state);
+            episode.set_commands(&self.task, &commands, env);
         }
         self.agent_commands.update(commands);
         self.command(actions)?;
@@ -309,16 +301,6 @@ impl<T: Task> VecEnv for TreeEnv<T> {
             TreeError::FixedBase { .. } => BackendError::CannotPush { robot: env, reason: "its base is fixed" }.into(),
             error => failed(error),
         })
-    }
-}
-
-/// Sets the agent's commands of environment `env` in the state of its episode.
-fn set_commands<T: Task>(task: &T, commands: &AgentCommands, env: usize, state: &mut T::State) {
-    if let Some(commands) = &commands.velocity {
-        task.set_velocity_command(state, commands[env]);
-    }
-    if let Some(commands) = &commands.gait {
-        task.set_gait_command(state, commands[env]);
     }
 }
 

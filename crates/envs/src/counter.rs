@@ -96,14 +96,7 @@ impl VecEnv for CounterEnv {
 
     fn step(&mut self, actions: &[f32]) -> Result<&StepBatch, EnvError> {
         let action_len = self.spec.action_len();
-        let expected = self.num_envs() * action_len;
-        if actions.len() != expected {
-            return Err(EnvError::WrongLength { field: "actions", given: actions.len(), expected });
-        }
-        if let Some(index) = actions.iter().position(|value| !value.is_finite()) {
-            let entry = self.spec.action_entry(index % action_len);
-            return Err(EnvError::ActionNotFinite { env: index / action_len, entry, value: actions[index] });
-        }
+        self.spec.check_actions(actions, self.num_envs())?;
         if let Some(env) = self.counters.iter().position(|counter| counter.resets == 0) {
             return Err(EnvError::NeedsReset { env });
         }

@@ -1,7 +1,7 @@
 //! Episode of one environment: random numbers, actions and sums of rewards, for any task.
 
 use rand::Rng;
-use twinstep_model::{Stream, stream};
+use twinstep_model::{AgentCommands, Stream, stream};
 
 use crate::Randomisation;
 use crate::task::{RobotView, Step, Task};
@@ -145,6 +145,16 @@ impl<S: Default> Episode<S> {
         }
         self.steps_to_push = randomise.sample_push_steps(policy_dt, &mut self.pushes);
         Some(randomise.sample_push(&mut self.pushes))
+    }
+
+    /// Sets the agent's commands of environment `env`.
+    pub fn set_commands(&mut self, task: &impl Task<State = S>, commands: &AgentCommands, env: usize) {
+        if let Some(commands) = &commands.velocity {
+            task.set_velocity_command(&mut self.state, commands[env]);
+        }
+        if let Some(commands) = &commands.gait {
+            task.set_gait_command(&mut self.state, commands[env]);
+        }
     }
 
     /// Stores the action before a step, clipped, and the joint velocities.

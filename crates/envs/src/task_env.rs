@@ -93,17 +93,7 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
     }
 
     fn check_actions(&self, actions: &[f32]) -> Result<(), EnvError> {
-        let action_len = self.spec.action_len();
-        let expected = self.num_envs() * action_len;
-        if actions.len() != expected {
-            return Err(EnvError::WrongLength { field: "actions", given: actions.len(), expected });
-        }
-        // One branch-free pass over all actions, which the compiler vectorises. The index is searched only on failure.
-        if !actions.iter().fold(true, |finite, value| finite & value.is_finite()) {
-            let index = actions.iter().position(|value| !value.is_finite()).unwrap_or_default();
-            let entry = self.spec.action_entry(index % action_len);
-            return Err(EnvError::ActionNotFinite { env: index / action_len, entry, value: actions[index] });
-        }
+        self.spec.check_actions(actions, self.num_envs())?;
         let restarts = self.autoreset != AutoresetMode::Disabled;
         let needs_reset = |episode: &Episode<T::State>| !episode.running && (!restarts || !episode.was_started());
         self.episodes.iter().position(needs_reset).map_or(Ok(()), |env| Err(EnvError::NeedsReset { env }))
@@ -121,7 +111,7 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
                 randomise.sample(sampled.as_ref().unwrap_or(nominal), random).or(sampled)
             });
             let q = per_joint(&start.q);
-            set_commands(task, &self.agent_commands, *env, &mut self.episodes[*env].state);
+            self.episodes[*env].set_commands(task, &self.agent_commands, *env);
             self.commands[*env].q = q;
             let initial_state = InitialState {
                 actuator_seed: start.actuator_seed,
@@ -213,7 +203,7 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
     /// Puts new commands of the agent into force.
     fn apply_commands(&mut self, commands: AgentCommands) {
         for (env, episode) in self.episodes.iter_mut().enumerate() {
-            set_commands(&self.task, &commands, env, &mut episode.state);
+            episode.set_commands(&self.task, &commands, env);
         }
         self.agent_commands.update(commands);
     }
@@ -297,16 +287,6 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
             final_obs,
             final_critic_obs,
         });
-    }
-}
-
-/// Sets the agent's commands of environment `env` in the state of its episode.
-fn set_commands<T: Task>(task: &T, commands: &AgentCommands, env: usize, state: &mut T::State) {
-    if let Some(commands) = &commands.velocity {
-        task.set_velocity_command(state, commands[env]);
-    }
-    if let Some(commands) = &commands.gait {
-        task.set_gait_command(state, commands[env]);
     }
 }
 

@@ -1,4 +1,4 @@
-//! Bounds of the agent's commands: those of the observation's entries.
+//! Checks of the agent's actions and commands: bounds of the commands are those of the observation's entries.
 
 use crate::{EnvError, EnvSpec, GaitCommand, VelocityCommand};
 
@@ -8,6 +8,22 @@ const VELOCITY_COMMAND: &str = "velocity_command";
 const GAIT_COMMAND: [(&str, usize); 2] = [("step_frequency", 1), ("phase_offset", 3)];
 
 impl EnvSpec {
+    /// Checks that there is a finite action for each of `num_envs` environments.
+    pub fn check_actions(&self, actions: &[f32], num_envs: usize) -> Result<(), EnvError> {
+        let (action_len, given) = (self.action_len(), actions.len());
+        let expected = num_envs * action_len;
+        if given != expected {
+            return Err(EnvError::WrongLength { field: "actions", given, expected });
+        }
+        // One branch-free pass over all actions, which the compiler vectorises. The index is searched only on failure.
+        if !actions.iter().fold(true, |finite, value| finite & value.is_finite()) {
+            let index = actions.iter().position(|value| !value.is_finite()).unwrap_or_default();
+            let entry = self.action_entry(index % action_len);
+            return Err(EnvError::ActionNotFinite { env: index / action_len, entry, value: actions[index] });
+        }
+        Ok(())
+    }
+
     /// Checks velocity commands, one per environment, against the bounds of `velocity_command`.
     pub fn check_velocity_commands(&self, commands: &[VelocityCommand], num_envs: usize) -> Result<(), EnvError> {
         match self.bounds(&[(VELOCITY_COMMAND, 3)]) {

@@ -168,3 +168,5 @@ fn composed(file: &ModelFile, name: &str) -> Result<RobotModel, ModelFileError> 
 
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod tree_tests;

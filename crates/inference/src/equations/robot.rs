@@ -1,20 +1,7 @@
 //! A robot as the equations see it: the tree, the joints, the feet, and what its sensors add.
 
 use glam::DVec3;
-use twinstep_model::{JointModel, Leg, RobotModel, RobotTree};
-
-/// Foot: a sphere at the end of a limb.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Foot {
-    /// Name, as in `contact_<name>`.
-    pub name: String,
-    /// Index of the body.
-    pub body: usize,
-    /// Centre in the frame of the body [m].
-    pub centre: DVec3,
-    /// Radius [m].
-    pub radius: f64,
-}
+use twinstep_model::{Feet, Foot, JointModel, RobotModel, RobotTree};
 
 /// Robot with everything that effects change.
 #[derive(Clone, Debug, PartialEq)]
@@ -41,17 +28,11 @@ impl From<&RobotModel> for Robot {
     fn from(robot: &RobotModel) -> Self {
         let mut tree = RobotTree::from(robot);
         tree.joints.iter_mut().for_each(|joint| joint.armature = 0.0);
-        let foot = |leg: Leg| Foot {
-            name: format!("{leg:?}"),
-            body: 3 * (leg as usize + 1),
-            centre: robot.shapes.foot_centre,
-            radius: robot.shapes.foot_radius,
-        };
         let derating = &robot.derating;
         Self {
             tree,
             joints: robot.joints.to_vec(),
-            feet: Leg::ALL.into_iter().map(foot).collect(),
+            feet: Feet::from(robot).feet().to_vec(),
             voltage_exponent: derating.voltage_exponent,
             thermal: derating
                 .per_kelvin

@@ -17,6 +17,8 @@ use crate::{BackendBuildError, Placement, SimConfig, SimConfigError, Terrain};
 pub struct MujocoTrees {
     process: Process,
     layout: Layout,
+    /// Model of the robots that the process was started with.
+    nominal: String,
     /// Shape of each geom of the layout.
     shapes: Vec<usize>,
     config: SimConfig,
@@ -85,11 +87,12 @@ impl MujocoTrees {
             iterations: config.solver_iterations(),
             steps: config.steps_per_actuator_period(actuator_hz),
         };
-        let hello = frames::hello(&settings, &layout, &mjcf(robot, &tree, config));
+        let nominal = mjcf(robot, &tree, config);
+        let hello = frames::hello(&settings, &layout, &nominal);
         let failed = |python: &Path, reason| BackendBuildError::Mujoco { python: python.to_owned(), reason };
         let process = Process::start(&python, &hello).map_err(|reason| failed(&python, reason))?;
         let robots = vec![Robot::new(robot); num_robots];
-        let mut this = Self { process, layout, shapes, config: *config, robots };
+        let mut this = Self { process, layout, nominal, shapes, config: *config, robots };
         for index in 0..num_robots {
             this.place(index, robot, initial_state)?;
         }
@@ -123,6 +126,8 @@ impl TreeEngine for MujocoTrees {
         let base = base.chain(&state.base_linear_velocity).chain(&state.base_angular_velocity);
         let row = base.map(|value| *value as f32).chain(q).chain(state.dq.iter().map(|dq| *dq as f32)).collect();
         let text = mjcf(model, &exported(model, &self.config, state), &self.config);
+        // An empty text is the nominal model, which is compiled already.
+        let text = if text == self.nominal { String::new() } else { text };
         self.request(RESET, &frames::reset(&[Reset { robot, state: row, mjcf: &text }]), &[robot])
     }
 
