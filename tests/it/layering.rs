@@ -205,7 +205,7 @@ const LINES_OF_QUADRUPEDS: [(&str, usize); 23] = [
     ("ensemble", 50),
     ("env-server", 2),
     ("crates/report", 18),
-    ("crates/inference", 8),
+    ("crates/inference", 7),
     ("crates/hunt", 27),
     ("crates/excite", 5),
     ("crates/bench", 21),
