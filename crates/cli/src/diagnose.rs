@@ -5,9 +5,11 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use indicatif::{ProgressBar, ProgressStyle};
 use twinstep_diagnose::{
-    DiagnoseError, Diagnosis, DiagnosisOutput, ParameterValue, RmsErrors, diagnose, diagnose_torques,
+    DiagnoseError, Diagnosis, DiagnosisOutput, ParameterValue, RmsErrors, TreeDiagnosis, diagnose, diagnose_tree,
 };
-use twinstep_logs::Log;
+use twinstep_effects::TreeModelFile;
+use twinstep_logs::replay::check_gains;
+use twinstep_logs::{Log, TorqueSensor};
 use twinstep_model::Joint;
 
 use crate::ambiguous_effects;
@@ -15,21 +17,21 @@ use crate::exit::{CommandResult, Failure, Signals, input, other};
 use crate::learned_residual;
 use crate::open_log::open_log;
 use crate::robot_file::{SimulatedRobot, analytic_model, simulator};
+use crate::tree_model::{actuator_hz, tree_model};
 use crate::view_log;
 use twinstep_report::report_data::{LogFacts, Provenance, ReportData};
 use twinstep_report::write_report;
 
 /// Find the effects that a robot model lacks, estimate their parameters and write the corrected model.
 ///
-/// A log with motor currents, and some rows with a fixed base, is compared with the equations of its drives, joints and base, without
-/// simulation: causes are the effects of highest evidence, and findings.json has each decision. Of other logs, and of several
-/// together, the commands are simulated, and the result is compared with the measurements. Every effect of the catalogue is
-/// tested on every joint, leg, side and joint type. The best candidates are fitted to one fold of the log and evaluated
-/// on the other. A candidate is reported as a cause if its log-likelihood gain exceeds a threshold and it explains at
-/// least 30 % of the residual power that it affects. The search then continues with the cause added to the model. If no
-/// effect of the catalogue is the cause, the report states what the residual depends on. If the log shows torques, or its
-/// base is fixed, an ensemble of networks then learns the missing torque. It is kept if it reduces the error on held-out
-/// blocks by a fifth; extended.toml adds it to the laws (`[actuator] mode = "residual"`).
+/// The rows of a log with torques are compared with the equations of its drives, joints and base, without simulation. Of a log
+/// without torques the rows with a fixed base are simulated. Causes are the effects of the catalogue with the highest evidence,
+/// beside everything that each robot has a little of. findings.json has each decision. If no effect of the catalogue is the cause,
+/// the report states what the residual depends on. If the log shows torques, or its base is fixed, an ensemble of networks then
+/// learns the missing torque. It is kept if it reduces the error on held-out blocks by a fifth; extended.toml adds it to the laws
+/// (`[actuator] mode = "residual"`).
+///
+/// Logs without torques on a free base are searched in simulations of all hypotheses, which is slower and less reliable.
 ///
 /// DIR gets report.html for a browser, findings.json for programs and extended.toml, the corrected model, which
 /// `twinstep serve --model` loads. motion_before.html and motion_after.html play the first 20 s of the log, with the
@@ -37,8 +39,8 @@ use twinstep_report::write_report;
 /// the safe motion that discriminates between them best. Execute it with `twinstep play` or on the robot, then diagnose
 /// both logs together.
 ///
-/// For a robot with other joint names, only the actuator torques are analysed. The baseline is an ideal actuator with
-/// the log's gains. Such a log needs `q_*`, `dq_*`, `q_cmd_*` and `tau_measured_*`, and DIR gets findings.json only.
+/// For a robot that is not like the Go2, give its URDF, MJCF or model file with --model: DIR gets findings.json and extended.toml.
+/// Gains that no file states are estimated first. Without --model only the drives are compared: that needs torques.
 ///
 /// Example: `twinstep diagnose data/go2_air_chirp --out diagnosis`
 #[derive(clap::Args)]
@@ -46,7 +48,7 @@ pub struct Args {
     /// Logs of one robot: data files, or folders that contain one.
     #[arg(required = true)]
     logs: Vec<PathBuf>,
-    /// Model file to correct. Default: the ideal Go2.
+    /// Model file to correct, or a robot file (URDF, MJCF). Default: the ideal Go2.
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
     /// Folder to write.
@@ -80,31 +82,25 @@ struct Unwritable {
     source: std::io::Error,
 }
 
-/// A model file was given for a robot that is not a Go2.
+/// A log has only positions, and nothing says which robot it is.
 #[derive(Debug, thiserror::Error)]
 #[error(
-    "--model {}: a model file describes a Go2, and a Go2 has no joint `{joint}`\n  omit --model to compare the log's \
-     actuators with ideal ones", model.display()
+    "the log has no torques, and `{joint}` is no joint of a Go2\n  give the robot's file with --model: positions are compared \
+     with a simulation of the robot"
 )]
-struct UnsupportedRobot {
-    model: PathBuf,
+struct NoRobot {
     joint: String,
 }
 
 /// Diagnoses the logs, writes the output folder and prints a summary.
 pub fn run(args: &Args) -> CommandResult {
-    let model = analytic_model(args.model.as_deref())?;
     let logs = args.logs.iter().map(|path| open_log(path)).collect::<Result<Vec<_>, _>>()?;
     // Checked before the search, so that its result cannot be lost.
     std::fs::create_dir_all(&args.out).map_err(|source| input(Unwritable { path: args.out.clone(), source }))?;
-    let other_joint = logs[0].joints().iter().find(|name| name.parse::<Joint>().is_err());
-    if let Some(joint) = other_joint {
-        let model = args.model.clone();
-        let refused = model.map_or(Ok(()), |model| Err(UnsupportedRobot { model, joint: joint.clone() }));
-        refused.map_err(input)?;
-        let diagnosis = with_progress(|progress| diagnose_torques(&logs, progress).map_err(failure))?;
-        return print_findings(&diagnosis, args);
+    if let Some(tree) = robot_of_tree(args, &logs)? {
+        return run_tree(args, &logs, tree);
     }
+    let model = analytic_model(args.model.as_deref())?;
     let robot = model.robot_model().map_err(input)?;
     let mut simulator = simulator(&robot)?;
     let (output, learned) = with_progress(|progress| {
@@ -163,6 +159,39 @@ pub fn run(args: &Args) -> CommandResult {
         }
     }
     Ok(())
+}
+
+/// Returns the robot if it is not like the Go2, or its gains are not known.
+fn robot_of_tree(args: &Args, logs: &[Log]) -> Result<Option<TreeModelFile>, Failure> {
+    let is_other = logs[0].joints().iter().any(|name| name.parse::<Joint>().is_err());
+    if args.model.is_some() || !is_other {
+        return tree_model(args.model.as_deref(), &logs[0]);
+    }
+    for log in logs {
+        check_gains(log).map_err(input)?;
+    }
+    let largest = |joint: &String| {
+        let torques = logs.iter().filter_map(|log| log.tau_measured(joint)).flatten();
+        let largest = torques.filter(|torque| torque.is_finite()).fold(0.0_f64, |most, torque| most.max(torque.abs()));
+        (joint.clone(), 2.0 * largest)
+    };
+    if logs[0].meta().tau_sensor == TorqueSensor::None {
+        return Err(input(NoRobot { joint: logs[0].joints()[0].clone() }));
+    }
+    Ok(Some(TreeModelFile::of_drives(&logs[0].joints().iter().map(largest).collect::<Vec<_>>())))
+}
+
+/// Diagnoses a robot of any tree, writes findings and corrected model, and prints a summary.
+fn run_tree(args: &Args, logs: &[Log], file: TreeModelFile) -> CommandResult {
+    let rate = actuator_hz(&file);
+    let found = with_progress(|progress| diagnose_tree(logs, &file, rate, progress).map_err(failure))?;
+    let TreeDiagnosis { mut diagnosis, extended } = found;
+    // Drives without a robot have no model file.
+    if args.model.is_some() || file.robot == TreeModelFile::go2().robot {
+        diagnosis.extended_model = "extended.toml".to_owned();
+        write_file(args, "extended.toml", &extended.to_toml())?;
+    }
+    print_findings(&diagnosis, args)
 }
 
 /// Writes the pages of the robot and its simulation with both models. Returns their names: none if the log cannot be played.

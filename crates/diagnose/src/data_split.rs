@@ -94,6 +94,12 @@ impl DataSplit {
     }
 }
 
+/// Returns for each row of a log whether it takes part in selections and fits.
+pub fn fitted_rows(log: &Log) -> Vec<bool> {
+    let split = DataSplit::new(log);
+    (0..log.rows()).map(|row| !split.is_held_out(row)).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use twinstep_logs::{Meta, Segment, TorqueSensor};

@@ -25,9 +25,6 @@
 //! - [`unexplained`]: describes the unexplained residual; [`explained_variance`]: how much of it depends on a variable;
 //!   [`spectral_line`]: its strongest frequency.
 //!
-//! Joints that are not a Go2's are diagnosed by their torques only: [`torque_only`], with [`joint_slots`] and
-//! [`torque_fit`].
-//!
 //! A candidate is accepted as a cause if its log-likelihood gain exceeds [`null_distribution::thresholds`], it explains
 //! at least [`forward_selection::MIN_EXPLAINED_FRACTION`] of the residual power above noise, and it exceeds a minimum
 //! size. All accepted causes are then refitted together, and the search continues.
@@ -41,6 +38,7 @@ mod cross_validation;
 mod data_split;
 mod discrimination;
 mod excitation;
+mod explained;
 mod experiment_design;
 mod explained_variance;
 mod final_fit;
@@ -50,9 +48,9 @@ mod friction_family;
 mod hypothesis;
 mod joint_gains;
 mod joint_samples;
-mod joint_slots;
 mod law_shape;
 mod null_distribution;
+mod of_tree;
 mod profile_likelihood;
 mod reporting;
 mod residual_data;
@@ -65,8 +63,6 @@ mod size_drift;
 mod spectral_line;
 #[cfg(test)]
 mod test_data;
-mod torque_fit;
-mod torque_only;
 mod true_law;
 mod unexplained;
 mod unreported_effects;
@@ -75,6 +71,7 @@ use std::collections::BTreeMap;
 
 use twinstep_effects::ModelFile;
 use twinstep_effects::{Effect, Scope};
+use twinstep_inference::InferenceError;
 use twinstep_logs::replay::check_gains;
 use twinstep_logs::{Log, TooSlowForMotion};
 use twinstep_model::{RobotModel, Rollout};
@@ -92,7 +89,7 @@ pub use findings::{
 use forward_selection::{ForwardSelection, WindowedData, write_estimates};
 use hypothesis::Hypothesis;
 use residual_data::ResidualData;
-pub use torque_only::diagnose_torques;
+pub use of_tree::{TreeDiagnosis, diagnose_tree};
 pub use true_law::true_law_gain;
 use twinstep_identify::ExperimentError;
 use twinstep_identify::evaluate::evaluate;
@@ -120,6 +117,12 @@ pub enum DiagnoseError {
     /// The sensors of a log are too slow for its motion.
     #[error(transparent)]
     TooSlowForMotion(#[from] TooSlowForMotion),
+    /// Logs of a robot of any tree differ.
+    #[error("the logs have other joints, torque sensors, rates or base orientations, or one states no gains: diagnose them one by one")]
+    Unlike,
+    /// A log and a robot of any tree cannot be compared.
+    #[error(transparent)]
+    Inference(#[from] InferenceError),
     /// `progress` returned false.
     #[error("interrupted before completion")]
     Interrupted,
@@ -157,9 +160,7 @@ pub fn diagnose(
         check_gains(log).map_err(ExperimentError::from)?;
         log.check_measurements_per_period()?;
     }
-    if let [log] = logs.as_slice()
-        && let Some(output) = by_equations::diagnose_by_equations(log, model, simulator, &mut say)?
-    {
+    if let Some(output) = by_equations::diagnose_by_equations(&logs, model, simulator, &mut say)? {
         return Ok(output);
     }
     say("fitting the ground and the nuisance parameters")?;

@@ -10,6 +10,8 @@ use crate::{Candidate, InferenceError, JointLog, Window};
 
 /// Robots that one core simulates together: full lanes, and few enough for its cache.
 const TOGETHER: usize = 64;
+/// Robots that one core steps at once.
+const LANES: usize = 4;
 
 /// Simulated signals in a window: one list for each joint of the log, with one entry for each row.
 #[derive(Clone, Debug, PartialEq)]
@@ -37,8 +39,9 @@ pub fn simulate(
         .flat_map(|candidate| windows.iter().zip(&clocks).map(move |(window, clock)| (candidate, window, clock)))
         .map(|(index, window, clock)| Job { log, robot: &robots[index], candidate: &candidates[index], window, clock })
         .collect();
+    let together = jobs.len().div_ceil(rayon::current_num_threads()).next_multiple_of(LANES).clamp(LANES, TOGETHER);
     let groups: Vec<_> =
-        jobs.par_chunks(TOGETHER).map(|jobs| run(jobs, actuator_hz, stop)).collect::<Result<_, _>>()?;
+        jobs.par_chunks(together).map(|jobs| run(jobs, actuator_hz, stop)).collect::<Result<_, _>>()?;
     let mut traces = groups.into_iter().flatten();
     Ok(candidates.iter().map(|_| traces.by_ref().take(windows.len()).collect()).collect())
 }

@@ -163,6 +163,48 @@ impl Log {
         }
     }
 
+    /// Joins logs of one robot: their segments follow each other, 10 s apart. Channels that one of them lacks are left out.
+    ///
+    /// Returns `None` if they have other joints, torque sensors, rates or orientations of a fixed base, or one of them no gains.
+    pub fn joined(logs: &[Self]) -> Option<Self> {
+        let (first, others) = logs.split_first()?;
+        let mut joined = first.clone();
+        if others.is_empty() {
+            return Some(joined);
+        }
+        let is_alike = |log: &&Self| {
+            log.joints == first.joints
+                && log.meta.tau_sensor == first.meta.tau_sensor
+                && log.meta.base_quat == first.meta.base_quat
+                && (log.meta.rate_hz / first.meta.rate_hz - 1.0).abs() < 0.01
+        };
+        if !others.iter().all(|log| is_alike(&log)) {
+            return None;
+        }
+        joined.channels.retain(|name, _| others.iter().all(|log| log.channels.contains_key(name)));
+        for joint in &first.joints {
+            for (index, quantity) in ["kp", "kd"].into_iter().enumerate() {
+                let gains: Option<Vec<Vec<f64>>> = logs.iter().map(|log| log.gains(joint)[index].clone()).collect();
+                joined.channels.insert(format!("{quantity}_{joint}"), gains?.concat());
+            }
+        }
+        (joined.meta.kp, joined.meta.kd) = (None, None);
+        for log in others {
+            let start = joined.t.last().map_or(0.0, |last| last + 10.0) - log.t.first().copied().unwrap_or(0.0);
+            let segments = joined.meta.segments.len() as u32;
+            joined.t.extend(log.t.iter().map(|t| start + t));
+            joined.segment.extend(log.segment.iter().map(|segment| segments + segment));
+            joined.episode.extend(&log.episode);
+            joined.meta.segments.extend(log.meta.segments.iter().cloned());
+            for (name, cells) in &mut joined.channels {
+                if !["kp_", "kd_"].iter().any(|gain| name.starts_with(gain)) {
+                    cells.extend(&log.channels[name]);
+                }
+            }
+        }
+        Some(joined)
+    }
+
     /// Returns all columns, in the order in which they are written.
     pub(crate) fn columns(&self) -> Vec<NamedColumn<'_>> {
         let mut columns = vec![

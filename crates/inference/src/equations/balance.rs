@@ -31,6 +31,8 @@ pub struct Balance {
     pub reference: Robot,
     /// Moment and force at the base, and torques of the joints, that the motion of the columns needs, by sample.
     pub needed: Vec<Vec<f64>>,
+    /// True if the measured torques are those on the links.
+    pub is_at_output: bool,
     /// The measured torques minus what the motion needs, for the reference, by sample.
     pub first_lacking: Vec<Vec<f64>>,
 }
@@ -50,6 +52,7 @@ impl Balance {
             joints,
             reference: robot.clone(),
             needed: Vec::new(),
+            is_at_output: measured.is_at_output,
             first_lacking: Vec::new(),
         };
         let needed = |sample: &Sample| balance.needed(&balance.bodies, robot, sample, &sample.instrument, [0.0; 3]);
@@ -119,7 +122,11 @@ impl Balance {
             }
             for (joint, rows) in measured.joints.iter().enumerate() {
                 let motor = sample.mean(&rows.torque);
-                lacking[6 + joint] += link_torque(&robot.joints[joint], motor, sample.response.of(joint));
+                lacking[6 + joint] += if self.is_at_output {
+                    motor
+                } else {
+                    link_torque(&robot.joints[joint], motor, sample.response.of(joint))
+                };
             }
             lacking
         };
@@ -213,9 +220,12 @@ impl Balance {
             }
             for joint in 0..self.joints {
                 let motor = motors[index][joint];
-                let late = delayed[joint].get(index).copied().unwrap_or(0.0);
-                all[6 + joint] +=
-                    sample.link_torque(robot, joint, motor) - sample.link_torque(&self.reference, joint, motor) + late;
+                all[6 + joint] += delayed[joint].get(index).copied().unwrap_or(0.0);
+                // What is between motor and link changes no torque on the link.
+                if !self.is_at_output {
+                    all[6 + joint] +=
+                        sample.link_torque(robot, joint, motor) - sample.link_torque(&self.reference, joint, motor);
+                }
             }
             for (residual, block, row) in &self.places[index] {
                 blocks[*block].y[*row] = self.projected(sample, &all, *residual);

@@ -111,6 +111,19 @@ impl Whitener {
         }
         white
     }
+
+    /// Returns the series times the inverse of the covariance: the scalar product with another series is that of both white series.
+    pub fn weighted(&self, series: &[f64]) -> Vec<f64> {
+        let mut weighted = self.whiten(series);
+        // The transpose of the filter runs backwards.
+        let mut state = 0.0;
+        for (value, [decay, gain, scale]) in weighted.iter_mut().zip(&self.rows).rev() {
+            let innovation = scale * *value + gain * state;
+            state = decay * (state - innovation);
+            *value = innovation / self.sigma;
+        }
+        weighted
+    }
 }
 
 #[cfg(test)]
@@ -138,5 +151,9 @@ mod tests {
         let white = whitener.whiten(&block.y);
         assert!((white.iter().map(|value| value * value).sum::<f64>() - expected).abs() < 1e-9);
         assert!((whitener.log_determinant - covariance.determinant().ln()).abs() < 1e-9);
+        let other = [0.3, 1.0, -0.7, 0.2, 0.9];
+        let product: f64 = white.iter().zip(whitener.whiten(&other)).map(|(one, other)| one * other).sum();
+        let weighted: f64 = whitener.weighted(&block.y).iter().zip(other).map(|(one, other)| one * other).sum();
+        assert!((product - weighted).abs() < 1e-9);
     }
 }

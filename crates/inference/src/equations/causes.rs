@@ -1,6 +1,6 @@
 //! Causes, and what a search finds.
 
-use super::system::Site;
+use super::site::Site;
 
 /// Standard deviation of a joint's value around that of its scope, where they are alike, relative to the prior's.
 const SPREAD: f64 = 0.15;

@@ -7,7 +7,7 @@ use twinstep_model::JointModel;
 use super::measurements::{JointRows, Measurements};
 use super::robot::Robot;
 
-/// Returns the torque that the motor-current sensor of a joint reads, by row [N·m].
+/// Returns the torque that the sensor of a joint reads, by row [N·m].
 ///
 /// The PD loop uses positions and velocities of the encoder by row, and is updated once per row.
 pub fn sensed_torque(measured: &Measurements, rows: &JointRows, [q, dq]: [&[f64]; 2], robot: &Robot) -> Vec<f64> {
@@ -32,6 +32,13 @@ pub fn sensed_torque(measured: &Measurements, rows: &JointRows, [q, dq]: [&[f64]
             if !torques[torques.len() - 1].is_finite() {
                 drive = SimdActuators::new(&[model], measured.dt, measured.dt);
                 drive.set(0, &[model], &[if q[row].is_finite() { q[row] } else { 0.0 }], &[0.0]);
+            }
+        }
+        if measured.is_at_output {
+            for (index, row) in range.clone().enumerate() {
+                let next = (row + 1).min(range.end - 1);
+                let [middle, slope] = [0.5 * (dq[row] + dq[next]), (dq[next] - dq[row]) / measured.dt];
+                torques[index] = link_torque(joint, torques[index], [q[row], middle, slope]);
             }
         }
         let delay = joint.actuator.sensor_delay / measured.dt;

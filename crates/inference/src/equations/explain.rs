@@ -1,29 +1,36 @@
 //! The causes of a log, in the terms of the catalogue.
 
+use std::ops::Range;
+
 use twinstep_effects::{Effect, Scope};
 use twinstep_logs::Log;
-use twinstep_model::{Joint, RobotModel};
+use twinstep_model::{Joint, RobotModel, RobotTree, TreeJoint, TreeModel};
 
-use super::causes::{Cause, Found, ScopeSites, UnknownLaw};
-use super::law::{Law, laws};
+use super::causes::{Cause, Found, FoundCause, ScopeSites, UnknownLaw};
+use super::law::{Law, Place, laws};
 use super::measurements::{Measurements, Regime};
 use super::outcome::TWO_SIDED_95;
+use super::positions::{Drives, Positions, is_simulated};
 use super::problem::Search;
 use super::robot::Robot;
-use super::system::{Site, System, apply, body_of};
+use super::site::{Site, apply, body_of};
+use super::system::System;
+use crate::{Candidate, InferenceError};
 
 /// Relative standard deviation of a value because no law is exact.
 const LAW_ERROR: f64 = 0.015;
 /// Prior probability that each joint of all, or of a type, has its own value.
 const EACH: f64 = 0.1;
+/// Variants of a law that are tried where each is a simulation.
+const FEW: usize = 6;
 /// Variance that is left in an equation, relative to that of its noise, which wrong statements about the noise allow.
 const UNEXPLAINED: f64 = 2.0;
 
 /// Values of an effect at a joint.
 #[derive(Clone, Debug, PartialEq)]
 pub struct OfJoint {
-    /// The joint.
-    pub joint: Joint,
+    /// Index of the joint in the robot.
+    pub joint: usize,
     /// Values of all parameters.
     pub values: Vec<f64>,
     /// 95 % interval of each value.
@@ -35,8 +42,8 @@ pub struct OfJoint {
 pub struct Explanation {
     /// The effect.
     pub effect: &'static Effect,
-    /// The scope.
-    pub scope: Scope,
+    /// Name of the scope, as in a model file.
+    pub scope: String,
     /// Values of all parameters: means over the scope.
     pub values: Vec<f64>,
     /// 95 % interval of each value.
@@ -48,7 +55,7 @@ pub struct Explanation {
     /// Share of the root mean square of the residuals that it explains, in the equations that it changes.
     pub explained: f64,
     /// Effects in its place, with their evidence minus that of the cause [nat].
-    pub rivals: Vec<(&'static Effect, Scope, Vec<f64>, f64)>,
+    pub rivals: Vec<(&'static Effect, String, Vec<f64>, f64)>,
 }
 
 /// What explains a log.
@@ -68,31 +75,86 @@ pub struct Explained {
     pub decisions: Vec<String>,
 }
 
-/// Finds what `robot` lacks, from the rows of `log` that are used.
+/// Finds what a quadruped lacks, from the rows of `log` that are used. `go_on` gets a line of progress.
 ///
-/// Returns `None` if the log has no motor currents, no velocities or unknown gains at a joint, or not all joints of the robot, and if the
-/// base moves but the log has no rows in which it is fixed, or stands on all feet with its orientation, angular velocity and acceleration. `go_on`
-/// gets a line of progress; the search ends with `None` if it returns false.
+/// Returns `None` if `go_on` returned false. Fails if the log has neither motor currents nor a fixed base.
 pub fn explain(
     log: &Log,
     robot: &RobotModel,
     is_used: impl Fn(usize) -> bool,
     go_on: &mut dyn FnMut(&str) -> bool,
-) -> Option<Explained> {
-    let robot = Robot::from(robot);
-    let measured = Measurements::new(log, &robot, is_used)?;
-    let system = System::new(measured, &robot);
-    let is_free = system.measured.regime.iter().any(|regime| *regime != Regime::Hang);
-    let hangs = system.measured.regime.contains(&Regime::Hang);
-    if is_free && !(hangs && system.balance.stands()) {
-        return None;
-    }
+) -> Result<Option<Explained>, InferenceError> {
+    let zeros = vec![0.0; robot.joints.len()];
+    let drives = Drives { kp: zeros.clone(), kd: zeros, actuator_hz: robot.control.actuator_hz };
+    explain_robot(log, Robot::from(robot), &drives, scopes(), is_used, go_on)
+}
+
+/// Finds what a robot of any tree lacks, as [`explain`] does. Of its bodies nothing is a cause: model files of trees have effects at joints.
+pub fn explain_tree(
+    log: &Log,
+    robot: &Candidate,
+    actuator_hz: f64,
+    is_used: impl Fn(usize) -> bool,
+    go_on: &mut dyn FnMut(&str) -> bool,
+) -> Result<Option<Explained>, InferenceError> {
+    let drives = Drives { kp: robot.kp.clone(), kd: robot.kd.clone(), actuator_hz };
+    explain_robot(log, Robot::from(&robot.robot), &drives, scopes_of(&robot.robot.tree), is_used, go_on)
+}
+
+fn explain_robot(
+    log: &Log,
+    robot: Robot,
+    drives: &Drives,
+    scopes: Vec<ScopeSites>,
+    is_used: impl Fn(usize) -> bool,
+    go_on: &mut dyn FnMut(&str) -> bool,
+) -> Result<Option<Explained>, InferenceError> {
     let mut laws = laws();
     for law in &mut laws {
         law.is_cause = !log.is_too_slow_for(law.effect);
     }
-    let found = Search::new(&system, &laws, scopes(), robot.clone()).run(go_on)?;
-    Some(explained(found, &laws, &robot))
+    let found = match Measurements::new(log, &robot, &is_used) {
+        Some(measured) => {
+            let system = System::new(measured, &robot);
+            let is_balanced = !system.balance.samples.is_empty()
+                && (system.measured.regime.contains(&Regime::Hang) || system.balance.stands());
+            for law in laws.iter_mut().filter(|_| !is_balanced) {
+                let is_of_joint = law.place == Place::Joint && system.measured.is_at_output;
+                law.is_cause &= matches!(law.place, Place::Drive | Place::Supply) || is_of_joint;
+            }
+            Search::new(&system, &laws, scopes, robot.clone()).run(go_on)
+        }
+        None => {
+            for law in &mut laws {
+                law.is_cause &= is_simulated(law);
+                few_variants(law);
+            }
+            let positions = Positions::new(log, &robot, &laws, &is_used, drives)?;
+            Search::new(&positions, &laws, scopes, robot.clone()).run(go_on)
+        }
+    };
+    Ok(found.map(|found| explained(found, &laws, &robot)))
+}
+
+/// Returns the root mean square error of the torques of a robot's drives, on measured states, in the rows that are used [N·m].
+///
+/// `None` if the log has no motor currents, or lacks what [`explain`] needs beside them.
+pub fn torque_error(log: &Log, robot: &TreeModel, is_used: impl Fn(usize) -> bool) -> Option<f64> {
+    let robot = Robot::from(robot);
+    let system = System::new(Measurements::new(log, &robot, is_used)?, &robot);
+    let blocks = system.residuals(&robot, &system.predicted(&robot));
+    let torques = blocks.iter().filter(|block| block.name.starts_with("torque")).flat_map(|block| &block.y);
+    let (sum, count) = torques.fold((0.0, 0.0), |(sum, count), error| (sum + error * error, count + 1.0));
+    (count > 0.0).then(|| (sum / count).sqrt())
+}
+
+/// Leaves every third variant of a law: each is a simulation.
+fn few_variants(law: &mut Law) {
+    for variants in [&mut law.strengths, &mut law.shapes] {
+        if variants.len() > FEW {
+            *variants = variants.iter().copied().skip(1).step_by(variants.len() / FEW).collect();
+        }
+    }
 }
 
 /// Returns the scopes with their prior probabilities: joints of one type are alike, and what one has, all may have.
@@ -121,38 +183,61 @@ fn scopes() -> Vec<ScopeSites> {
     of_joints.into_iter().chain(each).chain([of_base("base"), of_base("all")]).collect()
 }
 
+/// Returns the scopes of the joints of a tree.
+fn scopes_of(tree: &RobotTree) -> Vec<ScopeSites> {
+    let count = tree.joints.len();
+    let scope = |name: &str, joints: Range<usize>, probability: f64, is_alike: bool| ScopeSites {
+        name: name.to_owned(),
+        sites: joints.map(Site::Joint).collect(),
+        probability,
+        is_alike,
+    };
+    let of_joint = |(index, joint): (usize, &TreeJoint)| scope(&joint.name, index..index + 1, 0.3 / count as f64, true);
+    let all = [scope("all", 0..count, 0.3, true), scope("all", 0..count, EACH, false)];
+    all.into_iter().chain(tree.joints.iter().enumerate().map(of_joint)).collect()
+}
+
 /// Returns parameters of an effect within their bounds.
 fn clamped(effect: &Effect, values: Vec<f64>) -> Vec<f64> {
     let bounds = effect.parameters.iter().flat_map(|parameter| std::iter::repeat_n(parameter.bounds, parameter.count));
     values.into_iter().zip(bounds).map(|(value, [low, high])| value.clamp(low, high)).collect()
 }
 
+/// Returns true if the values of the joints differ from their mean by more than they are uncertain.
+fn differ(cause: &Cause, found: &FoundCause) -> bool {
+    let mean = cause.mean();
+    let is_far = |(value, (std, mean)): (&f64, (&f64, &f64))| (value - mean).abs() > TWO_SIDED_95 * std;
+    let of_site =
+        |(values, stds): (&Vec<f64>, &Vec<f64>)| values.iter().zip(stds.iter().zip(&mean)).any(is_far);
+    !cause.scope.is_alike || cause.values.iter().zip(&found.site_stds).any(of_site)
+}
+
 fn explained(found: Found, laws: &[Law], robot: &Robot) -> Explained {
-    let values_of = |cause: &Cause, unknowns: &[f64]| -> Vec<f64> {
+    let scale_of = |site: &Site| if let Site::Joint(joint) = site { robot.scale[*joint] } else { 1.0 };
+    let values_at = |cause: &Cause, unknowns: &[f64], scale: f64| -> Vec<f64> {
         let law = &laws[cause.law];
         if law.effect.name != "inertia" {
-            return (law.values)(unknowns, cause.shape);
+            return clamped(law.effect, law.parameters(unknowns, cause.shape, scale));
         }
         let (mut changed, site) = (robot.clone(), cause.scope.sites[0]);
         apply(&mut changed, law, site, unknowns, cause.shape);
-        changed.tree.bodies[body_of(site)].inertia.log_cholesky().to_vec()
+        clamped(law.effect, changed.tree.bodies[body_of(site)].inertia.log_cholesky().to_vec())
+    };
+    let mean_scale = |cause: &Cause| {
+        cause.scope.sites.iter().map(scale_of).sum::<f64>() / cause.scope.sites.len() as f64
     };
     let in_terms = |cause: &Cause| {
-        let law = &laws[cause.law];
-        let scope: Scope = cause.scope.name.parse().expect("the name of a scope");
-        let values = clamped(law.effect, values_of(cause, &cause.mean()));
-        (law.effect, scope, values)
+        (laws[cause.law].effect, cause.scope.name.clone(), values_at(cause, &cause.mean(), mean_scale(cause)))
     };
-    let intervals_of = |cause: &Cause, unknowns: &[f64], stds: &[f64]| {
-        let effect = laws[cause.law].effect;
-        let middle = clamped(effect, values_of(cause, unknowns));
+    let intervals_of = |cause: &Cause, unknowns: &[f64], stds: &[f64], scale: f64| {
+        let middle = values_at(cause, unknowns, scale);
         let mut intervals: Vec<[f64; 2]> = middle.into_iter().map(|value| [value; 2]).collect();
         for (unknown, std) in stds.iter().enumerate() {
             let half = TWO_SIDED_95 * std.hypot(LAW_ERROR * unknowns[unknown]);
             for side in [-half, half] {
                 let mut moved = unknowns.to_vec();
                 moved[unknown] += side;
-                let ends = clamped(effect, values_of(cause, &moved));
+                let ends = values_at(cause, &moved, scale);
                 for (interval, value) in intervals.iter_mut().zip(ends) {
                     *interval = [interval[0].min(value), interval[1].max(value)];
                 }
@@ -161,14 +246,19 @@ fn explained(found: Found, laws: &[Law], robot: &Robot) -> Explained {
         intervals
     };
     let causes = found.causes.iter().map(|found| {
-        let (effect, scope, values) = in_terms(&found.cause);
-        let intervals = intervals_of(&found.cause, &found.cause.mean(), &found.stds);
-        let sites = found.cause.scope.sites.iter().zip(found.cause.values.iter().zip(&found.site_stds));
+        let cause = &found.cause;
+        let (effect, scope, values) = in_terms(cause);
+        let intervals = intervals_of(cause, &cause.mean(), &found.stds, mean_scale(cause));
+        let sites = cause.scope.sites.iter().zip(cause.values.iter().zip(&found.site_stds));
+        let differs = differ(cause, found) || {
+            let first = scale_of(&cause.scope.sites[0]);
+            laws[cause.law].is_of_torque && cause.scope.sites.iter().any(|site| scale_of(site) != first)
+        };
         let by_joint = sites.filter_map(|(site, (unknowns, stds))| match site {
-            Site::Joint(joint) if !found.cause.scope.is_alike => Some(OfJoint {
-                joint: Joint::ALL[*joint],
-                values: clamped(effect, values_of(&found.cause, unknowns)),
-                intervals: intervals_of(&found.cause, unknowns, stds),
+            Site::Joint(joint) if differs => Some(OfJoint {
+                joint: *joint,
+                values: values_at(cause, unknowns, scale_of(site)),
+                intervals: intervals_of(cause, unknowns, stds, scale_of(site)),
             }),
             _ => None,
         });

@@ -10,7 +10,7 @@ use std::sync::{Arc, Mutex};
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 use rayon::prelude::*;
 
-use super::block::{Block, Column, SHAPES, Whitener};
+use super::block::{Block, Column, SHAPES, Shape, Whitener};
 
 /// Smallest variance of a block, relative to the stated noise.
 const LEAST_SCALE: f64 = 0.25;
@@ -19,28 +19,36 @@ const PRIOR_ROWS: f64 = 20.0;
 /// Most alternating estimates of unknowns, shapes and scales.
 const ITERATIONS: usize = 5;
 
-/// Sums of products of blocks that were computed before, by a hash of their residuals and columns.
+/// Products of the columns of stable unknowns that were computed before, by block.
 #[derive(Default)]
-pub struct Cache(Mutex<HashMap<u64, Arc<Vec<Products>>>>);
+pub struct Cache(Mutex<HashMap<u64, Arc<Vec<Stable>>>>);
+
+/// What does not change of a block while the columns of the first unknowns stay the same, for one shape.
+struct Stable {
+    whitener: Whitener,
+    gram: DMatrix<f64>,
+}
 
 impl Cache {
-    /// Forgets everything.
-    pub fn clear(&self) {
-        self.0.lock().expect("no panic").clear();
-    }
-
-    /// Returns the products of a block. The first `stable` unknowns have the same columns, at the same place in memory, until the cache is
-    /// cleared.
-    fn products(&self, block: &Block, members: &Members, stable: usize) -> Arc<Vec<Products>> {
-        let of_numbers = |hash: u64, numbers: &[f64]| numbers.iter().fold(hash, |hash, one| mixed(hash, one.to_bits()));
+    /// Returns the products of the columns of stable unknowns.
+    ///
+    /// They stay at their place in memory as long as the cache lives.
+    fn stable(&self, block: &Block, members: &[(usize, &[f64])]) -> Arc<Vec<Stable>> {
         let start = block.name.bytes().fold(members.len() as u64, |hash, byte| mixed(hash, u64::from(byte)));
-        let hash = members.iter().fold(of_numbers(start, &block.y), |hash, (unknown, part)| {
-            if *unknown < stable { mixed(hash, part.as_ptr() as u64) } else { of_numbers(hash, part) }
-        });
+        let hash = members.iter().fold(start, |hash, (_, part)| mixed(hash, part.as_ptr() as u64));
         if let Some(known) = self.0.lock().expect("no panic").get(&hash) {
             return known.clone();
         }
-        let computed = Arc::new(products(block, members));
+        let of_shape = |shape: &Shape| {
+            let whitener = Whitener::new(block, *shape);
+            let mut white = DMatrix::zeros(block.y.len(), members.len());
+            for (index, (_, part)) in members.iter().enumerate() {
+                white.column_mut(index).copy_from_slice(&whitener.whiten(part));
+            }
+            // Faster than `tr_mul`, which multiplies without blocks.
+            Stable { whitener, gram: white.transpose() * &white }
+        };
+        let computed = Arc::new(SHAPES.iter().map(of_shape).collect::<Vec<_>>());
         self.0.lock().expect("no panic").insert(hash, computed.clone());
         computed
     }
@@ -107,7 +115,7 @@ pub struct Posterior {
 
 /// Estimates shapes and scales, beginning with those of an earlier estimate, and integrates the unknowns out.
 ///
-/// The first groups stay at their place in memory until the cache is cleared.
+/// The first groups are those of the cache.
 pub fn posterior(
     blocks: &[Block],
     groups: [&[Group]; 2],
@@ -120,8 +128,8 @@ pub fn posterior(
     let size: usize = groups.iter().map(|group| group.columns.len()).sum();
     let (precision, prior_mean, prior_log_determinant) = prior(groups, size);
     let members = members(blocks.len(), groups);
-    let products: Vec<Arc<Vec<Products>>> =
-        blocks.par_iter().zip(&members).map(|(block, members)| cache.products(block, members, stable)).collect();
+    let products: Vec<Vec<Products>> =
+        blocks.par_iter().zip(&members).map(|(block, members)| products(block, members, stable, cache)).collect();
     let mut noise: Vec<(usize, f64)> = earlier.map_or_else(|| vec![(0, 1.0); blocks.len()], <[(usize, f64)]>::to_vec);
     let mut solution = solve(&products, &members, &noise, &precision, &prior_mean);
     for _ in 0..ITERATIONS {
@@ -200,26 +208,42 @@ fn prior(groups: &[&Group], size: usize) -> (DMatrix<f64>, DVector<f64>, f64) {
     (precision, mean, log_determinant)
 }
 
-fn products(block: &Block, members: &Members) -> Vec<Products> {
-    SHAPES
-        .iter()
-        .map(|shape| {
-            let whitener = Whitener::new(block, *shape);
-            let rows = block.y.len();
-            let mut white = DMatrix::zeros(rows, members.len());
-            for (index, (_, part)) in members.iter().enumerate() {
-                white.column_mut(index).copy_from_slice(&whitener.whiten(part));
+/// Returns the products of a block by shape. The columns of the first `stable` unknowns are those of the cache.
+fn products(block: &Block, members: &Members, stable: usize, cache: &Cache) -> Vec<Products> {
+    let split = members.partition_point(|(unknown, _)| *unknown < stable);
+    let known = cache.stable(block, &members[..split]);
+    let of_shape = |Stable { whitener, gram }: &Stable| {
+        let size = members.len();
+        let mut gram = gram.clone().resize(size, size, 0.0);
+        for (index, (_, part)) in members.iter().enumerate().skip(split) {
+            let weighted = whitener.weighted(part);
+            for (other, (_, part)) in members.iter().enumerate().take(index + 1) {
+                let product = dot(part, &weighted);
+                (gram[(other, index)], gram[(index, other)]) = (product, product);
             }
-            let y = DVector::from_vec(whitener.whiten(&block.y));
-            Products {
-                // Faster than `tr_mul`, which multiplies without blocks.
-                gram: white.transpose() * &white,
-                with_y: white.tr_mul(&y),
-                square: y.norm_squared(),
-                log_determinant: whitener.log_determinant,
-            }
-        })
-        .collect()
+        }
+        let weighted = whitener.weighted(&block.y);
+        Products {
+            gram,
+            with_y: DVector::from_iterator(size, members.iter().map(|(_, part)| dot(part, &weighted))),
+            square: dot(&block.y, &weighted),
+            log_determinant: whitener.log_determinant,
+        }
+    };
+    known.iter().map(of_shape).collect()
+}
+
+/// Returns the scalar product of two series, summed in lanes.
+fn dot(one: &[f64], other: &[f64]) -> f64 {
+    let mut lanes = [0.0; 8];
+    let (of_one, of_other) = (one.chunks_exact(8), other.chunks_exact(8));
+    let rest: f64 = of_one.remainder().iter().zip(of_other.remainder()).map(|(one, other)| one * other).sum();
+    for (one, other) in of_one.zip(of_other) {
+        for lane in 0..8 {
+            lanes[lane] += one[lane] * other[lane];
+        }
+    }
+    lanes.iter().sum::<f64>() + rest
 }
 
 struct Solution {
@@ -231,7 +255,7 @@ struct Solution {
 }
 
 fn solve(
-    products: &[Arc<Vec<Products>>],
+    products: &[Vec<Products>],
     members: &[Members],
     noise: &[(usize, f64)],
     precision: &DMatrix<f64>,
@@ -437,7 +461,7 @@ mod tests {
             let size = groups.len();
             let (precision, prior_mean, log_prior) = prior(groups, size);
             let members = members(1, groups);
-            let products = vec![Arc::new(products_of(&blocks[0], &members[0]))];
+            let products = vec![products(&blocks[0], &members[0], 0, &Cache::default())];
             let solution = solve(&products, &members, &before.noise, &precision, &prior_mean);
             let shift = &solution.mean - &prior_mean;
             let log_determinant =
@@ -452,9 +476,5 @@ mod tests {
         let (with, means) = fixed(&[&one, &other]);
         assert!((gain - (with - fixed(&[&one]).0)).abs() < 1e-6);
         assert!((mean[0] - means[1]).abs() < 1e-9);
-    }
-
-    fn products_of(block: &Block, members: &Members) -> Vec<Products> {
-        products(block, members)
     }
 }

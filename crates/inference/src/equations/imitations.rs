@@ -6,8 +6,9 @@ use super::fit::Fitted;
 use super::gaussian::{Group, Posterior, posterior};
 use super::law::Place;
 use super::problem::{EFFECT_PROBABILITY, Search, UNKNOWN_PROBABILITY};
+use super::residuals::{Residuals, State};
 use super::search::LEAST_GAIN;
-use super::system::{Predicted, Site, State};
+use super::site::Site;
 use super::unknown;
 
 /// Error of the form of a law of the catalogue, as the size of each function that it lacks, relative to its own.
@@ -17,15 +18,15 @@ const FORM_CHANGE: [f64; 2] = [0.05, 0.5];
 /// Least standard deviation of a function of the state; one that changes less is constant.
 const LEAST_CHANGE: f64 = 0.05;
 
-impl Search<'_> {
+impl<R: Residuals> Search<'_, R> {
     /// Removes causes whose law is another one.
-    pub fn without_imitations(&mut self, mut best: Fitted, small: &[Group]) -> Fitted {
+    pub fn without_imitations(&mut self, mut best: Fitted<R>) -> Fitted<R> {
         let mut place = 0;
         while place < best.causes.len() {
             let name = self.name(&best.causes[place]);
-            let changing = self.gain_of_changes(&best, small, place);
+            let changing = self.gain_of_changes(&best, place);
             self.note(format!("  {name} with a size that changes: {changing:.1} nat"));
-            let (without, replaced) = self.replaced(&best, small, place);
+            let (without, replaced) = self.replaced(&best, place);
             if let Some(gain) = replaced {
                 self.note(format!("  another law in place of {name}: {gain:.1} nat"));
             }
@@ -40,7 +41,7 @@ impl Search<'_> {
 
     /// Returns the fit without a cause, and by how much functions of what its joints measure are better in its place; `None` if they
     /// cannot take it.
-    fn replaced(&self, best: &Fitted, small: &[Group], place: usize) -> (Fitted, Option<f64>) {
+    fn replaced(&self, best: &Fitted<R>, place: usize) -> (Fitted<R>, Option<f64>) {
         let mut others = best.causes.clone();
         let cause = others.remove(place);
         let law = &self.laws[cause.law];
@@ -49,15 +50,15 @@ impl Search<'_> {
             Site::Base => None,
         };
         let joints: Vec<usize> = cause.scope.sites.iter().filter_map(joint_of).collect();
-        let without = self.fit(others, small, 2, Some(best));
+        let without = self.fit(others, &best.small, 2, Some(best));
         if joints.is_empty() || law.place == Place::Body {
             return (without, None);
         }
-        let functions = |predicted: &Predicted, joint: usize| -> Vec<Column> {
-            unknown::columns(self.system, predicted, joint, law.place).into_iter().map(|(_, column)| column).collect()
+        let functions = |predicted: &R::Predicted, joint: usize| -> Vec<Column> {
+            self.system.functions(predicted, joint, law.place).into_iter().map(|(_, column)| column).collect()
         };
         let free = joints.iter().map(|joint| Group::independent(functions(&without.predicted, *joint), unknown::STD));
-        let imitated = self.evidence_with(&without, small, best, free.collect())
+        let imitated = self.evidence_with(&without, best, free.collect())
             + (EFFECT_PROBABILITY * cause.scope.probability).ln();
         // A law of the catalogue may have a slightly different form.
         let unknowns = law.units.len();
@@ -70,12 +71,12 @@ impl Search<'_> {
             };
             functions(&best.predicted, *joint).into_iter().map(group)
         });
-        let named = self.evidence_with(best, small, best, near.collect());
+        let named = self.evidence_with(best, best, near.collect());
         (without, Some(imitated - named))
     }
 
     /// Returns by how much the law of a cause is better with a size that changes with the state: nothing of the catalogue does that.
-    pub fn gain_of_changes(&self, best: &Fitted, small: &[Group], place: usize) -> f64 {
+    pub fn gain_of_changes(&self, best: &Fitted<R>, place: usize) -> f64 {
         let cause = &best.causes[place];
         let unknowns = self.laws[cause.law].units.len();
         let mut changes = vec![Column::default(); MODULATORS.len()];
@@ -95,17 +96,17 @@ impl Search<'_> {
             return f64::NEG_INFINITY;
         }
         let count = changes.len();
-        let found = self.posterior_with(best, small, best, vec![Group::independent(changes, FORM_CHANGE[0])]);
+        let found = self.posterior_with(best, best, vec![Group::independent(changes, FORM_CHANGE[0])]);
         let first = found.mean.len() - count;
         let gain = |index: usize| gain_of_change(found.mean[index], found.covariance[(index, index)]);
         (first..first + count).map(gain).fold(f64::NEG_INFINITY, f64::max) + UNKNOWN_PROBABILITY.ln()
     }
 
     /// Returns an effect times a function of the state, which has no mean over the effect and a root mean square of one, or less.
-    fn modulated(&self, predicted: &Predicted, joint: Option<usize>, effect: &Column, function: Modulator) -> Column {
+    fn modulated(&self, predicted: &R::Predicted, joint: Option<usize>, effect: &Column, function: Modulator) -> Column {
         let size = root_mean_square(effect).max(1e-12);
         let part = |(block, rows): &(usize, Vec<f64>)| {
-            let times = &self.system.blocks[*block].t;
+            let times = &self.system.blocks()[*block].t;
             let value = |(row, entry): (usize, &f64)| {
                 let state = joint.map(|joint| self.system.state(predicted, joint, times[row]));
                 function(entry / size, times[row], state)
@@ -130,14 +131,14 @@ impl Search<'_> {
     }
 
     /// Returns the evidence of a fit with further unknowns, with the noise of `best`.
-    fn evidence_with(&self, fit: &Fitted, small: &[Group], best: &Fitted, further: Vec<Group>) -> f64 {
+    fn evidence_with(&self, fit: &Fitted<R>, best: &Fitted<R>, further: Vec<Group>) -> f64 {
         let log_prior: f64 = fit.causes.iter().map(|cause| cause.log_prior).sum();
-        self.posterior_with(fit, small, best, further).evidence + log_prior
+        self.posterior_with(fit, best, further).evidence + log_prior
     }
 
-    fn posterior_with(&self, fit: &Fitted, small: &[Group], best: &Fitted, further: Vec<Group>) -> Posterior {
+    fn posterior_with(&self, fit: &Fitted<R>, best: &Fitted<R>, further: Vec<Group>) -> Posterior {
         let groups: Vec<Group> = fit.groups.iter().cloned().chain(further).collect();
-        posterior(&fit.blocks, [small, &groups], Some(&best.posterior.noise), &self.cache)
+        posterior(&fit.blocks, [&fit.small.groups, &groups], Some(&best.posterior.noise), &fit.small.cache)
     }
 }
 

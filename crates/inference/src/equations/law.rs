@@ -40,11 +40,22 @@ pub struct Law {
     pub strengths: Vec<f64>,
     /// Values that are tried of a parameter which is no unknown of its own, such as the period of a ripple; one if there is none.
     pub shapes: Vec<f64>,
-    /// Returns the parameters of the effect, given the unknowns and the shape.
+    /// True if the first parameter is in proportion to the torque of a joint's motor: units and strengths are those of a Go2's.
+    pub is_of_torque: bool,
+    /// Returns the parameters of the effect, given the unknowns and the shape, at a joint of a Go2.
     pub values: fn(&[f64], f64) -> Vec<f64>,
 }
 
 impl Law {
+    /// Returns the parameters of the effect at a joint whose motor is by a factor stronger than a Go2's.
+    pub fn parameters(&self, unknowns: &[f64], shape: f64, scale: f64) -> Vec<f64> {
+        let mut values = (self.values)(unknowns, shape);
+        if self.is_of_torque {
+            values[0] *= scale;
+        }
+        values
+    }
+
     /// Returns true if the parameters of the effect are within their bounds.
     pub fn allows(&self, unknowns: &[f64], shape: f64) -> bool {
         // The parameters of other bodies depend on the body.
@@ -61,6 +72,19 @@ impl Law {
 /// Strengths that are tried, relative to the end of the prior range.
 const STRENGTHS: [f64; 12] = [0.03, 0.06, 0.1, 0.15, 0.22, 0.32, 0.45, 0.6, 0.8, 1.0, 1.25, 1.6];
 
+/// Effects whose first parameter is a torque, or what a torque of the motor moves.
+const OF_TORQUE: [&str; 9] = [
+    "torque_saturation",
+    "torque_dead_zone",
+    "torque_ripple",
+    "joint_elasticity",
+    "coulomb_friction",
+    "viscous_friction",
+    "stribeck_friction",
+    "armature",
+    "joint_spring",
+];
+
 fn law(name: &str, place: Place, units: &[f64], values: fn(&[f64], f64) -> Vec<f64>) -> Law {
     let effect = Effect::named(name).expect("an effect of the catalogue");
     Law {
@@ -71,6 +95,7 @@ fn law(name: &str, place: Place, units: &[f64], values: fn(&[f64], f64) -> Vec<f
         is_positive: false,
         strengths: Vec::new(),
         shapes: vec![0.0],
+        is_of_torque: OF_TORQUE.contains(&name),
         values,
     }
 }

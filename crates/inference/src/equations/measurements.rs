@@ -79,6 +79,8 @@ pub struct Measurements {
     pub contact: Vec<Vec<Option<bool>>>,
     /// Supply voltage divided by the highest of the log; empty if it was not measured.
     pub voltage_share: Vec<f64>,
+    /// True if the torque sensors are between gear and link, false if motor currents were measured.
+    pub is_at_output: bool,
     /// Standard deviation of the noise of position [rad], velocity [rad/s] and torque [N·m].
     pub noise: [f64; 3],
 }
@@ -86,9 +88,10 @@ pub struct Measurements {
 impl Measurements {
     /// Collects the channels of `log`, and the torques of the rows that are used.
     ///
-    /// Returns `None` if it has no motor currents, velocities or gains of a joint, or the joints are not those of the robot.
+    /// Returns `None` if it has no torques, velocities or gains of a joint, or the joints are not those of the robot.
     pub fn new(log: &Log, robot: &Robot, is_used: impl Fn(usize) -> bool) -> Option<Self> {
-        if log.meta().tau_sensor != TorqueSensor::MotorCurrent {
+        let sensor = log.meta().tau_sensor;
+        if sensor == TorqueSensor::None {
             return None;
         }
         let plain = |name: &str| name.to_lowercase().trim_end_matches("_joint").to_owned();
@@ -137,6 +140,7 @@ impl Measurements {
         Some(Self {
             base: base_rows(log),
             contact: contact_rows(log, robot),
+            is_at_output: sensor == TorqueSensor::JointOutput,
             voltage_share: voltage.map_or(Vec::new(), |cells| cells.into_iter().map(share).collect()),
             t,
             dt,

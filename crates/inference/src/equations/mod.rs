@@ -22,15 +22,18 @@ mod law;
 mod measurements;
 mod nuisance;
 mod outcome;
+mod positions;
 mod problem;
+mod residuals;
 mod robot;
 mod samples;
 mod screening;
 mod search;
+mod site;
 mod system;
 #[cfg(test)]
 mod tests;
 mod unknown;
 
 pub use causes::UnknownLaw;
-pub use explain::{Explained, Explanation, OfJoint, explain};
+pub use explain::{Explained, Explanation, OfJoint, explain, explain_tree, torque_error};

@@ -8,7 +8,8 @@ use super::block::Column;
 use super::gaussian::Group;
 use super::law::Law;
 use super::robot::Robot;
-use super::system::{Predicted, Site, System, apply};
+use super::site::{Site, apply};
+use super::system::{Predicted, System};
 
 /// Standard deviation of an effect's first unknowns where it is too small to be reported: name and values in its unit.
 ///
@@ -39,7 +40,7 @@ const LOW_SPEED: [(f64, f64); 2] = [(0.04, 0.2), (0.03, 0.8)];
 /// simulators update positions with the new one.
 const LEAD: f64 = 4e-4;
 /// Standard deviation of the tilt of a fixed base [rad].
-const TILT: f64 = 0.005;
+pub const TILT: f64 = 0.005;
 /// Standard deviation of an offset of the accelerometer, by its bias and its mounting [m/s²].
 const ACCELERATION: f64 = 0.1;
 /// Standard deviation of the position of the accelerometer in the base, along each axis [m].
@@ -47,9 +48,9 @@ const LEVER: f64 = 0.05;
 /// Standard deviation of an offset of a torque sensor [N·m].
 const TORQUE_OFFSET: f64 = 0.02;
 /// Standard deviation of a constant torque at a joint: cables, a preload, friction at rest [N·m].
-const STICK: f64 = 0.1;
+pub const STICK: f64 = 0.1;
 /// Standard deviations of a link's mass, and of its inertia relative to the trace; that of its centre of mass [m].
-const BODY: [f64; 3] = [0.03, 0.04, 0.003];
+pub const BODY: [f64; 3] = [0.03, 0.04, 0.003];
 
 /// Norm of what a small unknown changes in an equation, relative to the noise of a row, below which the equation does not show it.
 const LEAST_SEEN: f64 = 0.1;
@@ -74,8 +75,8 @@ pub fn of_joints(system: &System, laws: &[Law], robot: &Robot, predicted: &Predi
     }
     let ones = vec![1.0; system.balance.samples.len()];
     for joint in 0..robot.joints.len() {
-        small.push((system.torque_offset(joint), TORQUE_OFFSET));
-        small.push((system.balance.joint_column(joint, &ones), STICK));
+        small.push((system.torque_offset(joint), TORQUE_OFFSET * robot.scale[joint]));
+        small.push((system.balance.joint_column(joint, &ones), STICK * robot.scale[joint]));
     }
     [gains, grouped(system, small)].concat()
 }
@@ -152,15 +153,16 @@ fn by_joint(
 }
 
 /// Adds a small effect to what a joint has of it already.
-fn add(robot: &mut Robot, law: &Law, joint: usize, unknowns: &[f64], shape: f64) {
+pub fn add(robot: &mut Robot, law: &Law, joint: usize, unknowns: &[f64], shape: f64) {
+    let scale = robot.scale[joint];
     let actuator = &mut robot.joints[joint].actuator;
     match law.effect.name {
-        "torque_dead_zone" => actuator.dead_zone += 1.5 * unknowns[0],
+        "torque_dead_zone" => actuator.dead_zone += 1.5 * scale * unknowns[0],
         "drive_lag" => actuator.torque_time_constant += 0.015 * unknowns[0],
-        "torque_saturation" => actuator.saturation = 1.0 / (1.0 / actuator.saturation + unknowns[0] / 15.0),
+        "torque_saturation" => actuator.saturation = 1.0 / (1.0 / actuator.saturation + unknowns[0] / (15.0 * scale)),
         "torque_speed_limit" => actuator.no_load_speed = 1.0 / (1.0 / actuator.no_load_speed + unknowns[0] / 12.0),
         "joint_elasticity" => {
-            let compliance = 1.0 / actuator.gear_stiffness + unknowns[0];
+            let compliance = 1.0 / actuator.gear_stiffness + unknowns[0] / scale;
             actuator.gear_stiffness = 1.0 / compliance;
         }
         "supply_sag" => robot.voltage_exponent += 2.0 * unknowns[0],

@@ -10,6 +10,7 @@ use super::fit::Fitted;
 use super::gaussian::{Group, Scores, gain};
 use super::law::Place;
 use super::problem::{Rivals, Search, UNKNOWN_PROBABILITY, power};
+use super::residuals::Residuals;
 use super::{nuisance, unknown};
 
 /// Gain from which a law that the catalogue does not have is reported [nat].
@@ -18,9 +19,9 @@ const LEAST_UNKNOWN: f64 = 10.0;
 pub const TWO_SIDED_95: f64 = 1.96;
 const ONE_SIDED_95: f64 = 1.645;
 
-impl Search<'_> {
-    pub fn found(&mut self, best: Fitted, small: &[Group], given: &[f64]) -> Found {
-        let first: usize = small.iter().map(|group| group.columns.len()).sum();
+impl<R: Residuals> Search<'_, R> {
+    pub fn found(&mut self, best: Fitted<R>, given: &[f64]) -> Found {
+        let first = best.small.len();
         let starts: Vec<usize> = best
             .causes
             .iter()
@@ -48,7 +49,7 @@ impl Search<'_> {
         for (index, cause) in best.causes.iter().enumerate() {
             let mut others = best.causes.clone();
             others.remove(index);
-            let without = self.fit(others, small, 2, Some(&best));
+            let without = self.fit(others, &best.small, 2, Some(&best));
             let unknowns = cause.values[0].len();
             let own = |site: usize, unknown: usize| {
                 let place = starts[index] + site * unknowns + unknown;
@@ -62,7 +63,7 @@ impl Search<'_> {
             let rivals = self.rivals.iter().rfind(known).map_or(Vec::new(), |rivals| rivals.others.clone());
             let parts = best.groups[index].columns.iter().flat_map(|column| &column.parts);
             let changed: BTreeSet<usize> = parts.map(|(block, _)| *block).collect();
-            let sum = |fit: &Fitted| -> f64 {
+            let sum = |fit: &Fitted<R>| -> f64 {
                 let of = |block: &usize| fit.blocks[*block].y.len() as f64 * power(&fit.posterior.noise[*block]);
                 changed.iter().map(of).sum()
             };
@@ -83,9 +84,9 @@ impl Search<'_> {
         let causes = order.iter().map(|index| causes[*index].clone()).collect();
         let left = best.blocks.iter().zip(&best.posterior.noise).zip(given);
         let left = left.map(|((block, noise), given)| (block.name.clone(), [*given, power(noise)])).collect();
-        let unknown = self.unknown_laws(&best, small);
+        let unknown = self.unknown_laws(&best);
         Found {
-            gains_differ: gains_differ(&best, small),
+            gains_differ: gains_differ(&best),
             causes,
             left,
             decisions: std::mem::take(&mut self.decisions),
@@ -110,13 +111,16 @@ impl Search<'_> {
     /// Returns the joints at which functions of what they measure explain what the causes leave.
     ///
     /// They come after the catalogue: together, they imitate any of its laws.
-    fn unknown_laws(&self, best: &Fitted, small: &[Group]) -> Vec<UnknownLaw> {
-        let groups: Vec<&Group> = small.iter().chain(&best.groups).collect();
+    fn unknown_laws(&self, best: &Fitted<R>) -> Vec<UnknownLaw> {
+        let groups: Vec<&Group> = best.small.groups.iter().chain(&best.groups).collect();
         let mut found = Vec::new();
         for joint in 0..self.base.joints.len() {
-            for place in [Place::Drive, Place::Joint] {
+            for place in self.system.places().iter().copied() {
                 let (variables, columns): (Vec<_>, Vec<Column>) =
-                    unknown::columns(self.system, &best.predicted, joint, place).into_iter().unzip();
+                    self.system.functions(&best.predicted, joint, place).into_iter().unzip();
+                if columns.is_empty() {
+                    continue;
+                }
                 let size = columns.len();
                 let scores = Scores::new(&best.blocks, &groups, &best.posterior, &columns.iter().collect::<Vec<_>>());
                 let with_residual = DVector::from_fn(size, |row, _| scores.with_residual[row]);
@@ -137,11 +141,11 @@ impl Search<'_> {
 }
 
 /// Returns true if the errors of either gain are twice as large as they are uncertain, root mean square over the joints.
-fn gains_differ(best: &Fitted, small: &[Group]) -> bool {
+fn gains_differ<R: Residuals>(best: &Fitted<R>) -> bool {
     // Squares of the estimates and of their standard deviations.
     let mut squares = [[0.0; 2]; 2];
     let mut place = 0;
-    for group in small {
+    for group in &best.small.groups {
         if let Some(gain) = group.gain {
             squares[gain][0] += best.posterior.mean[place].powi(2);
             squares[gain][1] += best.posterior.covariance[(place, place)];

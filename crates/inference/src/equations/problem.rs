@@ -2,10 +2,9 @@
 
 use super::block::SHAPES;
 use super::causes::{Cause, ScopeSites};
-use super::gaussian::Cache;
 use super::law::Law;
+use super::residuals::Residuals;
 use super::robot::Robot;
-use super::system::System;
 
 /// Prior probability that an effect is a cause.
 pub const EFFECT_PROBABILITY: f64 = 1.0 / 12.0;
@@ -14,13 +13,12 @@ pub const EFFECT_PROBABILITY: f64 = 1.0 / 12.0;
 pub const UNKNOWN_PROBABILITY: f64 = 0.001;
 
 /// Search for causes.
-pub struct Search<'a> {
-    pub system: &'a System,
+pub struct Search<'a, R> {
+    pub system: &'a R,
     pub laws: &'a [Law],
     pub scopes: Vec<ScopeSites>,
     pub base: Robot,
     pub decisions: Vec<String>,
-    pub cache: Cache,
     /// Causes that were removed: law and scope. They are not tried again.
     pub removed: Vec<(usize, String)>,
     /// Candidates that were fitted when a cause was added.
@@ -35,16 +33,15 @@ pub struct Rivals {
     pub others: Vec<(Cause, f64)>,
 }
 
-impl<'a> Search<'a> {
+impl<'a, R: Residuals> Search<'a, R> {
     /// Prepares a search for what `base` lacks.
-    pub fn new(system: &'a System, laws: &'a [Law], scopes: Vec<ScopeSites>, base: Robot) -> Self {
+    pub fn new(system: &'a R, laws: &'a [Law], scopes: Vec<ScopeSites>, base: Robot) -> Self {
         Self {
             system,
             laws,
             scopes,
             base,
             decisions: Vec::new(),
-            cache: Cache::default(),
             removed: Vec::new(),
             rivals: Vec::new(),
         }

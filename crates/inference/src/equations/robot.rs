@@ -1,7 +1,9 @@
 //! A robot as the equations see it: the tree, the joints, the feet, and what its sensors add.
 
 use glam::DVec3;
-use twinstep_model::{Feet, Foot, JointModel, RobotModel, RobotTree};
+use twinstep_model::{Feet, Foot, JointModel, RobotModel, RobotTree, TreeModel};
+
+use crate::JointScale;
 
 /// Robot with everything that effects change.
 #[derive(Clone, Debug, PartialEq)]
@@ -10,6 +12,8 @@ pub struct Robot {
     pub tree: RobotTree,
     /// Joints with their actuators.
     pub joints: Vec<JointModel>,
+    /// How much stronger the motor of a joint is than a Go2's: the priors of torques scale with it.
+    pub scale: Vec<f64>,
     /// Feet.
     pub feet: Vec<Foot>,
     /// Exponent n of the supply law `τ (V / V_ref)ⁿ`.
@@ -32,6 +36,7 @@ impl From<&RobotModel> for Robot {
         Self {
             tree,
             joints: robot.joints.to_vec(),
+            scale: vec![1.0; robot.joints.len()],
             feet: Feet::from(robot).feet().to_vec(),
             voltage_exponent: derating.voltage_exponent,
             thermal: derating
@@ -41,6 +46,28 @@ impl From<&RobotModel> for Robot {
                 .map(|(a, b)| [a, b])
                 .collect(),
             gyro_bias: robot.gyro_bias,
+            ground_friction: robot.contact.friction,
+            contact_time: robot.contact.time_constant,
+        }
+    }
+}
+
+/// Torque limit of the joints of a Go2 [N·m]: hips and thighs.
+const OF_GO2: f64 = 23.7;
+
+impl From<&TreeModel> for Robot {
+    /// A robot of any tree, without feet.
+    fn from(robot: &TreeModel) -> Self {
+        let mut tree = robot.tree.clone();
+        tree.joints.iter_mut().for_each(|joint| joint.armature = 0.0);
+        Self {
+            tree,
+            joints: robot.joints.clone(),
+            scale: JointScale::of(robot).iter().map(|scale| scale.torque / OF_GO2).collect(),
+            feet: Vec::new(),
+            voltage_exponent: 0.0,
+            thermal: vec![[0.0; 2]; robot.joints.len()],
+            gyro_bias: DVec3::ZERO,
             ground_friction: robot.contact.friction,
             contact_time: robot.contact.time_constant,
         }

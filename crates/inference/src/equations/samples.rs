@@ -112,9 +112,12 @@ impl Sample {
     }
 }
 
-/// Collects the samples of a log.
+/// Collects the samples of a log; none if the bodies of the robot are not known.
 pub fn samples(measured: &Measurements, robot: &Robot) -> Vec<Sample> {
     let mut samples = Vec::new();
+    if robot.tree.bodies.iter().all(|body| body.inertia.mass == 0.0) {
+        return samples;
+    }
     let structure = TreeStructure::new(&robot.tree);
     let bodies = TreeParameters::splat(&robot.tree);
     let steps = SAMPLE_S.map(|time| ((time / measured.dt).round() as usize).max(1));

@@ -1,7 +1,6 @@
 //! Screening: the gain of every effect on every scope, at the noise of the causes that were found.
 
 use nalgebra::{DMatrix, DVector};
-use rayon::prelude::*;
 use twinstep_effects::Target;
 
 use super::block::Column;
@@ -10,12 +9,15 @@ use super::fit::Fitted;
 use super::gaussian::{Group, Scores, gain};
 use super::law::Law;
 use super::problem::{EFFECT_PROBABILITY, Search};
-use super::system::{Site, apply};
+use super::residuals::{Change, Residuals};
+use super::site::{Site, apply};
 
 /// Standard deviation of a strength around one that is tried, relative to it.
 const CELL: f64 = 0.3;
 /// Size at a site above which a cause is large there, relative to its largest.
 pub const LARGE: f64 = 0.3;
+/// Size at a site, relative to the largest, above which a cause whose sites have their own values is present there.
+pub const PRESENT: f64 = 0.1;
 /// Candidates that are fitted in full after each screening, and at most of one effect.
 const FITTED: [usize; 2] = [6, 3];
 
@@ -29,12 +31,12 @@ struct Candidate {
     column: Column,
 }
 
-impl Search<'_> {
+impl<R: Residuals> Search<'_, R> {
     /// Returns the best candidates for a further cause, with their gains at the noise of the current fit.
-    pub fn screen(&self, best: &Fitted, small: &[Group]) -> Vec<(f64, Cause)> {
+    pub fn screen(&self, best: &Fitted<R>) -> Vec<(f64, Cause)> {
         let candidates = self.candidates(best);
         let columns: Vec<&Column> = candidates.iter().map(|candidate| &candidate.column).collect();
-        let groups: Vec<&Group> = small.iter().chain(&best.groups).collect();
+        let groups: Vec<&Group> = best.small.groups.iter().chain(&best.groups).collect();
         let scores = Scores::new(&best.blocks, &groups, &best.posterior, &columns);
         let mut hypotheses: Vec<(f64, Cause)> = Vec::new();
         for law in 0..self.laws.len() {
@@ -72,7 +74,7 @@ impl Search<'_> {
         self.laws[law].strengths.len().max(self.laws[law].shapes.len())
     }
 
-    fn candidates(&self, best: &Fitted) -> Vec<Candidate> {
+    fn candidates(&self, best: &Fitted<R>) -> Vec<Candidate> {
         let mut all: Vec<(usize, usize, Site, usize)> = Vec::new();
         for (index, law) in self.laws.iter().enumerate() {
             let mut sites: Vec<Site> = self.scopes_of(law).flat_map(|scope| scope.sites.iter().copied()).collect();
@@ -84,20 +86,27 @@ impl Search<'_> {
                 }
             }
         }
-        all.par_iter()
-            .map(|(index, variant, site, unknown)| {
-                let law = &self.laws[*index];
-                let mut unknowns = vec![0.0; law.units.len()];
-                unknowns[*unknown] = law.strengths.get(*variant).copied().unwrap_or(0.5 * law.units[*unknown]);
-                let shape = law.shapes.get(*variant).copied().unwrap_or(law.shapes[0]);
-                let mut after = best.robot.clone();
-                apply(&mut after, law, *site, &unknowns, shape);
-                let step = if law.strengths.is_empty() { unknowns[*unknown] } else { 1.0 };
-                let column = self.system.column(law, *site, (&best.robot, &best.predicted), &after).scaled(1.0 / step);
-                Candidate { law: *index, variant: *variant, site: *site, unknown: *unknown, column }
-            })
-            .filter(|candidate| !candidate.column.is_zero())
-            .collect()
+        let unknowns_of = |(index, variant, _, unknown): &(usize, usize, Site, usize)| {
+            let law = &self.laws[*index];
+            let mut unknowns = vec![0.0; law.units.len()];
+            unknowns[*unknown] = law.strengths.get(*variant).copied().unwrap_or(0.5 * law.units[*unknown]);
+            unknowns
+        };
+        let change = |one: &(usize, usize, Site, usize)| {
+            let law = &self.laws[one.0];
+            let shape = law.shapes.get(one.1).copied().unwrap_or(law.shapes[0]);
+            let mut after = best.robot.clone();
+            apply(&mut after, law, one.2, &unknowns_of(one), shape);
+            Change { law, site: one.2, after }
+        };
+        let changes: Vec<Change> = all.iter().map(change).collect();
+        let columns = self.system.columns((&best.robot, &best.predicted), &changes);
+        let candidate = |(one, column): (&(usize, usize, Site, usize), Column)| {
+            let (law, variant, site, unknown) = *one;
+            let step = if self.laws[law].strengths.is_empty() { unknowns_of(one)[unknown] } else { 1.0 };
+            Candidate { law, variant, site, unknown, column: column.scaled(1.0 / step) }
+        };
+        all.iter().zip(columns).map(candidate).filter(|candidate| !candidate.column.is_zero()).collect()
     }
 
     pub fn scopes_of<'b>(&'b self, law: &'b Law) -> impl Iterator<Item = &'b ScopeSites> {
@@ -117,7 +126,7 @@ impl Search<'_> {
         own: &[usize],
         candidates: &[Candidate],
         scores: &Scores,
-        best: &Fitted,
+        best: &Fitted<R>,
     ) -> Vec<(f64, Cause)> {
         let law = &self.laws[law_index];
         let products = DMatrix::from_fn(own.len(), own.len(), |row, column| {
@@ -178,7 +187,7 @@ impl Search<'_> {
             let cause =
                 Cause { law: law_index, scope: scope.clone(), shape, values, log_prior: log_prior + log_shapes };
             // Joints of which some have nothing are another scope.
-            let is_scope = cause.scope.is_alike || cause.smallest_share(&law.units) > LARGE;
+            let is_scope = cause.scope.is_alike || cause.smallest_share(&law.units) > PRESENT;
             if is_scope && law.allows(&cause.mean(), shape) {
                 found.push((gain + log_prior + log_grid, cause));
             }

@@ -1,51 +1,48 @@
 //! The search for the set of causes of highest evidence.
 
+use std::sync::Arc;
+
 use super::causes::{Cause, Found, ScopeSites};
 use super::fit::Fitted;
-use super::gaussian::Group;
 use super::nuisance;
-use super::problem::{Rivals, Search, power};
-use super::robot::Robot;
-use super::screening::LARGE;
-use super::system::{Predicted, Site};
+use super::outcome::TWO_SIDED_95;
+use super::problem::{EFFECT_PROBABILITY, Rivals, Search, power};
+use super::screening::{LARGE, PRESENT};
+use super::residuals::Residuals;
+use super::site::Site;
 
 /// Gain of the evidence above which a cause is added or kept [nat].
 pub const LEAST_GAIN: f64 = 3.0;
 /// Other scopes of a cause that are tried.
 const OTHER_SCOPES: usize = 3;
-/// Iterations of a fit that is compared with another one of the same causes.
-const CONVERGED: usize = 8;
+/// Steps of the fit of what every joint has its own of.
+const USUAL_STEPS: usize = 8;
 /// Most causes.
 const MOST_CAUSES: usize = 6;
 /// Causes that were added and removed again, after which the search ends.
 const MOST_REMOVED: usize = 2;
 
-impl Search<'_> {
+impl<R: Residuals> Search<'_, R> {
     /// Searches. `go_on` gets a line of progress, and ends the search if it returns false.
     pub fn run(mut self, go_on: &mut dyn FnMut(&str) -> bool) -> Option<Found> {
-        let predicted = self.system.predicted(&self.base);
-        let of_bodies = nuisance::of_bodies(self.system, self.laws, &self.base, &predicted);
-        let small_of = |this: &Self, robot: &Robot, predicted: &Predicted| {
-            this.cache.clear();
-            let of_joints = nuisance::of_joints(this.system, this.laws, robot, predicted);
-            [of_bodies.as_slice(), &of_joints].concat()
-        };
-        let mut small = small_of(&self, &self.base, &predicted);
+        let predicted = self.system.predicted(std::slice::from_ref(&self.base)).remove(0);
+        let small = Arc::new(self.system.small(self.laws, &self.base, &predicted));
         let mut best = self.fit(Vec::new(), &small, 1, None);
         let given: Vec<f64> = best.posterior.noise.iter().map(power).collect();
         self.note(format!("no cause: {:.1} nat", best.evidence));
+        best = self.with_usual(best, go_on)?;
         while best.causes.len() < MOST_CAUSES && self.removed.len() < MOST_REMOVED {
             if !go_on(&self.progress(&best)) {
                 return None;
             }
-            let candidates = self.screen(&best, &small);
-            let mut fits: Vec<(f64, Fitted)> = Vec::new();
+            let candidates = self.screen(&best);
+            let mut fits: Vec<(f64, Fitted<R>)> = Vec::new();
             for (screened, cause) in candidates {
                 if !go_on(&format!("{}, trying {}", self.progress(&best), self.name(&cause))) {
                     return None;
                 }
                 let causes = [best.causes.as_slice(), &[cause]].concat();
-                fits.push((screened, self.fit(causes, &small, 3, Some(&best))));
+                fits.push((screened, self.fit(causes, &best.small, self.system.trial_steps(), Some(&best))));
             }
             for (screened, fit) in &fits {
                 let cause = &fit.causes[fit.causes.len() - 1];
@@ -57,11 +54,11 @@ impl Search<'_> {
                 );
                 self.note(line);
             }
-            let mut fits: Vec<Fitted> = fits.into_iter().map(|(_, fit)| fit).filter(|fit| fit.is_possible).collect();
+            let mut fits: Vec<Fitted<R>> = fits.into_iter().map(|(_, fit)| fit).filter(|fit| fit.is_possible).collect();
             fits.sort_by(|one, other| other.evidence.total_cmp(&one.evidence));
             let mut fits = fits.into_iter();
             let Some(next) = fits.next() else { break };
-            let rival = |fit: Fitted| (fit.causes[fit.causes.len() - 1].clone(), fit.evidence - next.evidence);
+            let rival = |fit: Fitted<R>| (fit.causes[fit.causes.len() - 1].clone(), fit.evidence - next.evidence);
             let rivals: Vec<(Cause, f64)> = fits.map(rival).collect();
             if next.evidence - best.evidence < LEAST_GAIN {
                 break;
@@ -79,26 +76,27 @@ impl Search<'_> {
             if !go_on(&self.progress(&best)) {
                 return None;
             }
-            small = small_of(&self, &best.robot, &best.predicted);
-            best = self.fit(best.causes.clone(), &small, CONVERGED, Some(&best));
-            best = self.with_best_scope(best, &small);
+            let small = Arc::new(self.system.small(self.laws, &best.robot, &best.predicted));
+            best = self.fit(best.causes.clone(), &small, self.system.fit_steps(), Some(&best));
+            let last = best.causes.len() - 1;
+            best = self.with_best_scope(best, last);
             if !best.is_possible {
-                best = self.without_last(best, &small);
+                best = self.without_last(best);
             }
-            best = self.without_surplus(best, &small);
+            best = self.without_surplus(best);
         }
         if !go_on(&self.progress(&best)) {
             return None;
         }
-        best = self.without_imitations(best, &small);
-        Some(self.found(best, &small, &given))
+        best = self.without_imitations(best);
+        Some(self.found(best, &given))
     }
 
     pub fn note(&mut self, line: String) {
         self.decisions.push(line);
     }
 
-    fn progress(&self, best: &Fitted) -> String {
+    fn progress(&self, best: &Fitted<R>) -> String {
         let names: Vec<String> = best.causes.iter().map(|cause| self.name(cause)).collect();
         if names.is_empty() { "looking for causes".to_owned() } else { format!("found {}", names.join(", ")) }
     }
@@ -107,15 +105,58 @@ impl Search<'_> {
         format!("{}@{}", self.laws[cause.law].effect.name, cause.scope.label())
     }
 
-    /// Tries other scopes of the last cause: those that contain the sites where it is large, the narrowest first.
-    fn with_best_scope(&mut self, mut best: Fitted, small: &[Group]) -> Fitted {
-        let last = best.causes.len() - 1;
+    /// Returns a fit of what every joint of a real robot has its own of, without what the log does not need.
+    ///
+    /// Beside each other they explain little of what each seems to explain alone, so that adding them one by one begins with the wrong one.
+    fn with_usual(&mut self, mut best: Fitted<R>, go_on: &mut dyn FnMut(&str) -> bool) -> Option<Fitted<R>> {
+        let usual = self.system.usual();
+        let scope = self.scopes.iter().filter(|scope| !scope.is_alike).max_by_key(|scope| scope.sites.len()).cloned();
+        let (Some(scope), false) = (scope, usual.is_empty()) else { return Some(best) };
+        let cause = |name: &&str| {
+            let law = self.laws.iter().position(|law| law.effect.name == *name).expect("a law of the catalogue");
+            let strengths = self.laws[law].strengths.len().max(1) as f64;
+            let log_prior = EFFECT_PROBABILITY.ln() + scope.probability.ln() + std::f64::consts::LN_2 - strengths.ln();
+            let values = vec![vec![0.1 * self.laws[law].units[0]]; scope.sites.len()];
+            Cause { law, scope: scope.clone(), shape: self.laws[law].shapes[0], values, log_prior }
+        };
+        let causes: Vec<Cause> = usual.iter().map(cause).collect();
+        if !go_on("fitting the friction, the inertia and the delay of each joint") {
+            return None;
+        }
+        let all = self.fit(causes, &best.small, USUAL_STEPS, Some(&best));
+        self.note(format!("{} at each joint: {:.1} nat", usual.join(", "), all.evidence - best.evidence));
+        for cause in &all.causes {
+            self.note(format!("  {}: {:.4?}", self.name(cause), cause.values));
+        }
+        best = self.without_surplus(all);
+        for place in 0..best.causes.len() {
+            if !go_on(&self.progress(&best)) {
+                return None;
+            }
+            best = self.with_best_scope(best, place);
+        }
+        self.removed.clear();
+        Some(best)
+    }
+
+    /// Tries other scopes of a cause: those that contain the sites where it is large, the narrowest first.
+    fn with_best_scope(&mut self, mut best: Fitted<R>, last: usize) -> Fitted<R> {
         let cause = best.causes[last].clone();
         let law = &self.laws[cause.law];
         let sizes = cause.sizes(&law.units);
         let largest = sizes.iter().copied().fold(0.0, f64::max);
-        let sites = cause.scope.sites.iter().zip(&sizes);
-        let large: Vec<Site> = sites.filter(|(_, size)| **size > LARGE * largest).map(|(site, _)| *site).collect();
+        // A little of an effect is at every joint.
+        let usual = |values: &Vec<f64>| {
+            let is_usual = |(unknown, value): (usize, &f64)| {
+                value.abs() < TWO_SIDED_95 * nuisance::small_std(law.effect.name, unknown)
+            };
+            values.iter().enumerate().all(is_usual)
+        };
+        let is_large = |place: &usize| sizes[*place] > LARGE * largest && !usual(&cause.values[*place]);
+        let large: Vec<Site> = (0..sizes.len()).filter(is_large).map(|place| cause.scope.sites[place]).collect();
+        if large.is_empty() {
+            return best;
+        }
         let mut scopes: Vec<ScopeSites> = self
             .scopes_of(law)
             .filter(|scope| *scope != &cause.scope && large.iter().all(|site| scope.sites.contains(site)))
@@ -139,8 +180,8 @@ impl Search<'_> {
             let log_prior = cause.log_prior - cause.scope.probability.ln() + scope.probability.ln();
             let mut causes = best.causes.clone();
             causes[last] = Cause { scope, values, log_prior, ..cause.clone() };
-            let other = self.fit(causes, small, CONVERGED, Some(&best));
-            let is_scope = other.causes[last].scope.is_alike || other.causes[last].smallest_share(&law.units) > LARGE;
+            let other = self.fit(causes, &best.small, self.system.fit_steps(), Some(&best));
+            let is_scope = other.causes[last].scope.is_alike || other.causes[last].smallest_share(&law.units) > PRESENT;
             if is_scope && other.is_possible && other.evidence > best.evidence {
                 let line =
                     format!("  scope {}: {:.1} nat", other.causes[last].scope.label(), other.evidence - best.evidence);
@@ -152,21 +193,21 @@ impl Search<'_> {
     }
 
     /// Removes the cause that was added last, because its best parameters are not possible.
-    fn without_last(&mut self, best: Fitted, small: &[Group]) -> Fitted {
+    fn without_last(&mut self, best: Fitted<R>) -> Fitted<R> {
         let mut causes = best.causes.clone();
         let Some(cause) = causes.pop() else { return best };
         self.note(format!("- {}: its parameters are not possible", self.name(&cause)));
         self.removed.push((cause.law, cause.scope.label()));
-        self.fit(causes, small, 2, Some(&best))
+        self.fit(causes, &best.small, 2, Some(&best))
     }
 
     /// Removes causes that no longer have evidence beside the others.
-    fn without_surplus(&mut self, mut best: Fitted, small: &[Group]) -> Fitted {
+    fn without_surplus(&mut self, mut best: Fitted<R>) -> Fitted<R> {
         while !best.causes.is_empty() {
             let fits = (0..best.causes.len()).map(|removed| {
                 let mut causes = best.causes.clone();
                 causes.remove(removed);
-                (removed, self.fit(causes, small, 2, Some(&best)))
+                (removed, self.fit(causes, &best.small, 2, Some(&best)))
             });
             let (removed, without) =
                 fits.max_by(|one, other| one.1.evidence.total_cmp(&other.1.evidence)).expect("causes");

@@ -1,48 +1,30 @@
 //! All equations of a log: blocks of residuals, and the column of any change of the robot.
 
-use glam::{DMat3, DVec3};
+use std::sync::OnceLock;
+
 use rayon::prelude::*;
-use twinstep_effects::Apply;
 
 use super::balance::{Balance, advanced};
 use super::block::{Block, Column};
 use super::drive::{link_torque, sensed_torque};
+use super::gaussian::Group;
 use super::law::{Law, Place};
+use super::nuisance;
 use super::measurements::{JointRows, Measurements, Regime};
+use super::residuals::{Change, Residuals, Small, State};
 use super::robot::Robot;
 use super::samples::Sample;
+use super::site::Site;
+use super::unknown;
 
 /// Rows at the start of a range in which a drive has the commands of before [s].
 const HISTORY_S: f64 = 0.05;
-/// Mass above which a payload changes the inertia of a body, too [kg], if it is no farther from the body's origin than this [m].
-const LEAST_PAYLOAD: f64 = 0.05;
-const LONGEST_ARM: f64 = 0.5;
-/// Least factor on the second moment of a body along an axis.
-const LEAST_MOMENT: f64 = 0.1;
+/// Speed below which the dry friction between motor and torque sensor is not determined [rad/s].
+const LEAST_SPEED: f64 = 0.1;
 /// Torque within which the teeth of a gear with backlash change sides [N·m].
 const SLACK: f64 = 0.05;
 /// Time between samples of the gyroscope [s].
 const GYRO_S: f64 = 0.05;
-
-/// Where a law acts.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Site {
-    /// A joint, or its link.
-    Joint(usize),
-    /// The base.
-    Base,
-}
-
-/// State of a joint.
-#[derive(Clone, Copy, Debug)]
-pub struct State {
-    /// Position [rad].
-    pub q: f64,
-    /// Velocity [rad/s].
-    pub dq: f64,
-    /// Torque of the drive [N·m].
-    pub torque: f64,
-}
 
 /// The equations of a log.
 pub struct System {
@@ -63,6 +45,8 @@ pub struct System {
     first_residual: Vec<Vec<f64>>,
     /// The robot whose residuals are from measured torques.
     reference: Robot,
+    /// Small unknowns of bodies and their motion.
+    of_bodies: OnceLock<Vec<Group>>,
 }
 
 /// Torques that a robot's drives have on the measured states, by joint.
@@ -93,13 +77,6 @@ impl System {
     /// Returns blocks and rows of the torques of a joint.
     pub fn drive_rows(&self, joint: usize) -> &[(usize, Vec<usize>)] {
         &self.drive_rows[joint]
-    }
-
-    /// Returns the state of a joint at a time of the log [s].
-    pub fn state(&self, predicted: &Predicted, joint: usize, t: f64) -> State {
-        let row = self.measured.t.partition_point(|time| *time < t).min(self.measured.t.len() - 1);
-        let [q, dq] = [0, 1].map(|quantity| self.measured.joints[joint].smooth[quantity][row]);
-        State { q, dq, torque: predicted.sensed[joint][row] }
     }
 
     /// Collects the equations of a log.
@@ -134,7 +111,16 @@ impl System {
             .zip(&of_smooth)
             .map(|(lacking, sensed)| lacking.iter().zip(sensed).map(|(lacking, sensed)| lacking + sensed).collect());
         let first_residual = first_residual.collect();
-        Self { measured, balance, blocks, drive_rows, gyro_rows, first_residual, reference: robot.clone() }
+        Self {
+            measured,
+            balance,
+            blocks,
+            drive_rows,
+            gyro_rows,
+            first_residual,
+            reference: robot.clone(),
+            of_bodies: OnceLock::new(),
+        }
     }
 
     /// Returns the torques of the drives of a robot.
@@ -209,6 +195,9 @@ impl System {
             (Place::Supply, Site::Base) => {
                 let columns = (0..robot.joints.len()).map(|joint| self.drive_column(joint, predicted, after));
                 Column { parts: columns.flat_map(|column| column.parts).collect() }
+            }
+            (Place::Joint, Site::Joint(joint)) if self.measured.is_at_output => {
+                self.drive_column(joint, predicted, after)
             }
             (Place::Joint, Site::Joint(joint)) => self.joint_column(joint, robot, after, predicted),
             (Place::Sensor, Site::Joint(joint)) => {
@@ -316,7 +305,8 @@ fn drive_blocks(measured: &Measurements, robot: &Robot, blocks: &mut Vec<Block>)
         let mut parts = Vec::new();
         for regime in [Regime::Hang, Regime::Stand, Regime::Move] {
             let own = |row: &usize| {
-                measured.regime[*row] == regime && rows.torque[*row].is_finite() && sensed[*row].is_finite()
+                let is_known = !measured.is_at_output || rows.smooth[1][*row].abs() > LEAST_SPEED;
+                measured.regime[*row] == regime && rows.torque[*row].is_finite() && sensed[*row].is_finite() && is_known
             };
             let inner = measured.ranges.iter().flat_map(|range| range.start + skipped..range.end.saturating_sub(2));
             let kept: Vec<usize> = inner.filter(own).collect();
@@ -354,54 +344,59 @@ fn gyro_blocks(measured: &Measurements, blocks: &mut Vec<Block>) -> Vec<(usize, 
         .collect()
 }
 
-/// Changes a robot by a law at a site.
-pub fn apply(robot: &mut Robot, law: &Law, site: Site, unknowns: &[f64], shape: f64) {
-    if unknowns.iter().all(|unknown| *unknown == 0.0) {
-        return;
-    }
-    let values = (law.values)(unknowns, shape);
-    match (law.effect.name, site) {
-        ("supply_sag", _) => robot.voltage_exponent = values[0],
-        ("thermal_derating", Site::Joint(joint)) => robot.thermal[joint] = [values[0], values[1]],
-        ("gyro_bias", _) => robot.gyro_bias += DVec3::new(values[0], values[1], values[2]),
-        ("payload", site) => {
-            // The unknowns are mass and first moment, in which forces are nearly linear.
-            let body = &mut robot.tree.bodies[body_of(site)].inertia;
-            let mass = unknowns[0].max(-0.9 * body.mass);
-            let moment = DVec3::new(unknowns[1], unknowns[2], unknowns[3]);
-            if mass.abs() > LEAST_PAYLOAD && (moment / mass).length() < LONGEST_ARM {
-                *body = body.with_point_mass(mass, moment / mass);
-            } else {
-                let total = body.mass + mass;
-                body.com = (body.mass * body.com + moment) / total;
-                body.mass = total;
-            }
-        }
-        ("inertia", site) => {
-            let body = &mut robot.tree.bodies[body_of(site)].inertia;
-            let trace = |matrix: &DMat3| matrix.x_axis.x + matrix.y_axis.y + matrix.z_axis.z;
-            let factor = |axis: usize| (1.0 + unknowns[axis]).max(LEAST_MOMENT).sqrt();
-            let stretch = DMat3::from_diagonal(DVec3::new(factor(0), factor(1), factor(2)));
-            let moments = DMat3::from_diagonal(DVec3::splat(0.5 * trace(&body.inertia))) - body.inertia;
-            let moments = stretch * moments * stretch;
-            body.inertia = DMat3::from_diagonal(DVec3::splat(trace(&moments))) - moments;
-        }
-        ("com_shift", site) => {
-            robot.tree.bodies[body_of(site)].inertia.com += DVec3::new(values[0], values[1], values[2]);
-        }
-        (_, Site::Joint(joint)) => {
-            if let Apply::Joint(change) = law.effect.apply {
-                let _ = change(&mut robot.joints[joint], &values);
-            }
-        }
-        (_, Site::Base) => {}
-    }
-}
+impl Residuals for System {
+    type Predicted = Predicted;
 
-/// Returns the index of the body at a site.
-pub fn body_of(site: Site) -> usize {
-    match site {
-        Site::Joint(joint) => joint + 1,
-        Site::Base => 0,
+    fn usual(&self) -> &[&'static str] {
+        &[]
+    }
+
+    fn trial_steps(&self) -> usize {
+        3
+    }
+
+    fn fit_steps(&self) -> usize {
+        8
+    }
+
+    fn blocks(&self) -> &[Block] {
+        &self.blocks
+    }
+
+    fn predicted(&self, robots: &[Robot]) -> Vec<Predicted> {
+        robots.iter().map(|robot| self.predicted(robot)).collect()
+    }
+
+    fn residuals(&self, robot: &Robot, predicted: &Predicted) -> Vec<Block> {
+        self.residuals(robot, predicted)
+    }
+
+    fn columns(&self, before: (&Robot, &Predicted), changes: &[Change]) -> Vec<Column> {
+        changes.par_iter().map(|change| self.column(change.law, change.site, before, &change.after)).collect()
+    }
+
+    fn small(&self, laws: &[Law], robot: &Robot, predicted: &Predicted) -> Small {
+        let of_joints = nuisance::of_joints(self, laws, robot, predicted);
+        // Their columns hardly depend on the robot.
+        let of_bodies = self.of_bodies.get_or_init(|| nuisance::of_bodies(self, laws, robot, predicted));
+        Small::new([of_bodies.as_slice(), &of_joints].concat())
+    }
+
+    fn apply_small(&self, _: &[Law], _: &mut Robot, _: &mut [f64]) -> bool {
+        false
+    }
+
+    fn places(&self) -> &[Place] {
+        &[Place::Drive, Place::Joint]
+    }
+
+    fn functions(&self, predicted: &Predicted, joint: usize, place: Place) -> Vec<(&'static str, Column)> {
+        unknown::columns(self, predicted, joint, place)
+    }
+
+    fn state(&self, predicted: &Predicted, joint: usize, t: f64) -> State {
+        let row = self.measured.t.partition_point(|time| *time < t).min(self.measured.t.len() - 1);
+        let [q, dq] = [0, 1].map(|quantity| self.measured.joints[joint].smooth[quantity][row]);
+        State { q, dq, torque: predicted.sensed[joint][row] }
     }
 }

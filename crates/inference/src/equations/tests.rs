@@ -1,6 +1,7 @@
 //! Properties of the equations on a robot that hangs, sways and trots, whose signals are sines.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
 use twinstep_model::{BaseMount, JOINT_NAMES, go2};
@@ -12,7 +13,9 @@ use super::measurements::Measurements;
 use super::problem::Search;
 use super::robot::Robot;
 use super::search::LEAST_GAIN;
-use super::system::{Site, System, apply};
+use super::residuals::Small;
+use super::site::{Site, apply};
+use super::system::System;
 
 const ROWS: usize = 1200;
 const LEGS: [&str; 4] = ["FL", "FR", "RL", "RR"];
@@ -182,8 +185,8 @@ fn gain_of_a_changing_delay(delay: impl Fn(f64) -> f64) -> f64 {
     let scope = ScopeSites { name: "all".to_owned(), sites, probability: 0.3, is_alike: true };
     let cause = Cause { law, scope, shape: 0.0, values: vec![vec![0.25]; 12], log_prior: 0.0 };
     let search = Search::new(&system, &all, Vec::new(), robot);
-    let fit = search.fit(vec![cause], &[], 8, None);
-    search.gain_of_changes(&fit, &[], 0)
+    let fit = search.fit(vec![cause], &Arc::new(Small::default()), 8, None);
+    search.gain_of_changes(&fit, 0)
 }
 
 #[test]

@@ -1,0 +1,125 @@
+//! Findings of a report from the causes that explain a log.
+
+use std::collections::BTreeMap;
+
+use twinstep_effects::Effect;
+use twinstep_inference::equations::{Explained, Explanation, UnknownLaw};
+
+use super::findings::{
+    AlternativeCause, Cause, CorrelatedPair, Estimate, ParameterValue, Unexplained, WeightedHypothesis,
+};
+use super::{reporting, unexplained};
+
+/// Evidence by which a cause must be better than without it [nat].
+pub const LEAST_GAIN: f64 = 3.0;
+/// Evidence by which a rival may be worse than a cause, and still be as good an explanation: odds of 20 to 1 [nat].
+pub const AMBIGUOUS: f64 = 3.0;
+/// Absolute correlation of two estimates from which they are reported.
+const CORRELATED: f64 = 0.9;
+
+/// Returns the strongest law that the catalogue does not have.
+pub fn unexplained_law(found: &Explained) -> Unexplained {
+    let Some(UnknownLaw { joint, of_drive, variable, gain }) = found.unknown.first() else {
+        return unexplained::only_noise();
+    };
+    let channel = if *variable == "t" { "t".to_owned() } else { format!("{variable}_{joint}") };
+    let place = if *of_drive { "The torque of the drive" } else { "The torque on the link" };
+    let others = found.unknown.len() - 1;
+    let more = if others == 0 { String::new() } else { format!(" So do {others} more equations.") };
+    let text = format!(
+        "{place} of {joint} has another law, which the catalogue does not have: a function of {channel} and others explains what the causes leave, with {gain:.0} nat.{more}"
+    );
+    Unexplained { fraction: found.left, depends_on: vec![channel], text }
+}
+
+/// Returns the pairs of causes whose estimates are highly correlated.
+pub fn confusable(found: &Explained) -> Vec<CorrelatedPair> {
+    let is_high = |(one, other, correlation): &&(usize, usize, f64)| {
+        correlation.abs() >= CORRELATED && found.causes[*one].effect != found.causes[*other].effect
+    };
+    let pair = |(one, other, correlation): &(usize, usize, f64)| {
+        let [one, other] = [*one, *other].map(|index| found.causes[index].effect);
+        CorrelatedPair {
+            effects: [one.name.to_owned(), other.name.to_owned()],
+            correlation: *correlation,
+            experiment: reporting::experiment_between(one, other),
+        }
+    };
+    found.correlations.iter().filter(is_high).map(pair).collect()
+}
+
+/// Returns the finding of a cause. `joints` are the names of the robot's joints.
+pub fn finding(cause: &Explanation, joints: &[String]) -> Cause {
+    let close: Vec<_> = cause.rivals.iter().filter(|(.., behind)| *behind > -AMBIGUOUS).collect();
+    let total = 1.0 + close.iter().map(|(.., behind)| behind.exp()).sum::<f64>();
+    let weighted = |effect: &Effect, scope: &str, weight: f64| WeightedHypothesis {
+        effect: effect.name.to_owned(),
+        scope: scope.to_owned(),
+        probability: weight / total,
+    };
+    let of_rivals = close.iter().map(|(effect, scope, _, behind)| weighted(effect, scope, behind.exp()));
+    let rival = |(effect, scope, ..): &&(&Effect, String, Vec<f64>, f64)| AlternativeCause {
+        effect: effect.name.to_owned(),
+        scope: scope.clone(),
+        held_out_gain: cause.explained,
+    };
+    Cause {
+        effect: cause.effect.name.to_owned(),
+        scope: cause.scope.clone(),
+        parameters: estimates(cause),
+        held_out_gain: cause.explained,
+        score_nats: cause.gain,
+        threshold_nats: LEAST_GAIN,
+        ambiguous_with: close.iter().map(|(effect, scope, ..)| format!("{}@{scope}", effect.name)).collect(),
+        posterior: std::iter::once(weighted(cause.effect, &cause.scope, 1.0)).chain(of_rivals).collect(),
+        drifts: None,
+        remedy: cause.effect.remedy.to_owned(),
+        rivals: close.iter().map(rival).collect(),
+        evidence: evidence(cause, joints),
+    }
+}
+
+/// Returns the estimates of the parameters, by name.
+fn estimates(cause: &Explanation) -> BTreeMap<String, Estimate> {
+    let mut place = 0;
+    let mut estimates = BTreeMap::new();
+    for parameter in cause.effect.parameters {
+        let range = place..place + parameter.count;
+        place = range.end;
+        let of = |number: &dyn Fn(usize) -> f64| {
+            let all: Vec<f64> = range.clone().map(number).collect();
+            if let [one] = all.as_slice() { ParameterValue::Number(*one) } else { ParameterValue::Vector(all) }
+        };
+        let estimate = Estimate {
+            value: of(&|index| cause.values[index]),
+            low: of(&|index| cause.intervals[index][0]),
+            high: of(&|index| cause.intervals[index][1]),
+        };
+        estimates.insert(parameter.name.to_owned(), estimate);
+    }
+    estimates
+}
+
+/// Returns why a cause is reported, as sentences.
+fn evidence(cause: &Explanation, joints: &[String]) -> String {
+    let first = &cause.effect.parameters[0];
+    let size = format!("{:.4} {}", cause.values[0], first.unit);
+    let name = cause.effect.name.replace('_', " ");
+    let mut evidence = format!(
+        "{name} at {}, {} {}: without it, the other causes explain the log {:.0} nat less.",
+        cause.scope,
+        first.name,
+        size.trim_end(),
+        cause.gain
+    );
+    if let Some((effect, scope, _, behind)) = cause.rivals.first() {
+        let rival = effect.name.replace('_', " ");
+        evidence = format!("{evidence} In its place, {rival} at {scope} is {:.0} nat behind.", -behind);
+    }
+    if !cause.by_joint.is_empty() {
+        let all: Vec<String> =
+            cause.by_joint.iter().map(|own| format!("{} {:.3}", joints[own.joint], own.values[0])).collect();
+        evidence = format!("{evidence} Each joint has its own: {}.", all.join(", "));
+    }
+    evidence + " " + cause.effect.signature
+}

@@ -1,0 +1,153 @@
+//! Diagnosis of a robot of any tree: the causes of highest evidence in the equations of its logs.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use twinstep_effects::{JointEffect, JointScope, TreeModelFile};
+use twinstep_inference::equations::{Explanation, explain_tree, torque_error};
+use twinstep_inference::{
+    Candidate, IdentifyOptions, InferenceError, JointLog, ParameterRequest, evaluate, identify,
+};
+use twinstep_logs::Log;
+
+use super::data_split::fitted_rows;
+use super::explained::{confusable, finding, unexplained_law};
+use super::findings::{Diagnosis, RmsErrors};
+use super::{DiagnoseError, DiagnoseProgress, held_out_rows};
+
+/// Time that is simulated to estimate gains [s], in blocks of this length [s].
+const MOST_S: f64 = 40.0;
+const BLOCK_S: f64 = 4.0;
+
+/// Result of a diagnosis of a robot of any tree.
+#[derive(Clone, Debug)]
+pub struct TreeDiagnosis {
+    /// The findings. The caller that writes the files sets `extended_model`.
+    pub diagnosis: Diagnosis,
+    /// The given model with unknown gains, the causes and their intervals.
+    pub extended: TreeModelFile,
+}
+
+/// Identifies the effects that a robot of any tree lacks, from `logs` of one robot.
+///
+/// Gains that neither the logs nor the model file state are estimated first, with frictions, inertias and a delay.
+pub fn diagnose_tree(
+    logs: &[Log],
+    file: &TreeModelFile,
+    actuator_hz: f64,
+    progress: &mut DiagnoseProgress,
+) -> Result<TreeDiagnosis, DiagnoseError> {
+    for log in logs {
+        log.check_measurements_per_period()?;
+    }
+    let joined = Log::joined(logs).ok_or(DiagnoseError::Unlike)?;
+    let is_used: Vec<bool> = logs.iter().flat_map(fitted_rows).collect();
+    let held_out: Vec<bool> = logs.iter().flat_map(held_out_rows).collect();
+    let given = with_gains(file, &joined, &is_used, actuator_hz, progress)?;
+    let robot = Candidate::of(&given)?;
+    let mut go_on = |text: &str| progress(text);
+    let found = explain_tree(&joined, &robot, actuator_hz, |row| is_used[row], &mut go_on)?;
+    let found = found.ok_or(DiagnoseError::Interrupted)?;
+    let joints: Vec<String> = file.nominal.tree.joints.iter().map(|joint| joint.name.clone()).collect();
+    let extended = extended(&given, &found.causes, &joints);
+    let errors = |file: &TreeModelFile| errors(&joined, file, &held_out, actuator_hz);
+    let diagnosis = Diagnosis {
+        baseline: errors(&given)?,
+        extended: errors(&extended)?,
+        noise_floor: noise_floor(&joined),
+        findings: found.causes.iter().map(|cause| finding(cause, &joints)).collect(),
+        joint_gains: std::collections::BTreeMap::new(),
+        confusable: confusable(&found),
+        unexplained: unexplained_law(&found),
+        learned_residual: None,
+        next_experiment: None,
+        decisions: found.decisions,
+        extended_model: String::new(),
+    };
+    Ok(TreeDiagnosis { diagnosis, extended })
+}
+
+/// Returns the model with estimates of the gains that the log does not state.
+fn with_gains(
+    file: &TreeModelFile,
+    log: &Log,
+    is_used: &[bool],
+    actuator_hz: f64,
+    progress: &mut DiagnoseProgress,
+) -> Result<TreeModelFile, DiagnoseError> {
+    let stated = |joint: &String| log.gains(joint).iter().all(Option::is_some);
+    if log.joints().iter().all(stated) {
+        return Ok(file.clone());
+    }
+    // The gains of a long log show in a part of it.
+    let block = (BLOCK_S * log.meta().rate_hz).max(1.0) as usize;
+    let step = (log.duration_s() / MOST_S).ceil().max(1.0) as usize;
+    let is_kept = |row: usize| is_used[row] && (row / block).is_multiple_of(step);
+    let joint_log = JointLog::new(log, &file.nominal.tree, is_kept)?;
+    let requests = ParameterRequest::DEFAULT.map(|request| ParameterRequest(request.to_owned())).to_vec();
+    let stop = Arc::new(AtomicBool::new(false));
+    let options = IdentifyOptions { requests, actuator_hz, stop: stop.clone() };
+    let mut each = |round: usize, rounds: usize, _| {
+        if !progress(&format!("estimating the gains that the log does not state, round {round} of {rounds}")) {
+            stop.store(true, Ordering::Relaxed);
+        }
+    };
+    let found = identify(file, &joint_log, &options, &mut each)?;
+    if found.interrupted {
+        return Err(DiagnoseError::Interrupted);
+    }
+    Ok(TreeModelFile { kp: found.model.kp, kd: found.model.kd, ..file.clone() })
+}
+
+/// Returns the model with the causes and their intervals.
+fn extended(file: &TreeModelFile, causes: &[Explanation], joints: &[String]) -> TreeModelFile {
+    let mut extended = file.clone();
+    for cause in causes {
+        let entry = |scope: JointScope, values: &[f64], intervals: &[[f64; 2]]| JointEffect {
+            effect: cause.effect,
+            scope,
+            values: values.to_vec(),
+            intervals: intervals.iter().map(|interval| Some(*interval)).collect(),
+        };
+        if cause.by_joint.is_empty() {
+            let scope = match cause.scope.as_str() {
+                "all" => JointScope::All,
+                joint => JointScope::Joint(joint.to_owned()),
+            };
+            extended.effects.push(entry(scope, &cause.values, &cause.intervals));
+            continue;
+        }
+        for own in &cause.by_joint {
+            let scope = JointScope::Joint(joints[own.joint].clone());
+            extended.effects.push(entry(scope, &own.values, &own.intervals));
+        }
+    }
+    extended
+}
+
+/// Returns the errors of a model in rows: of positions on a fixed base, and of torques if motor currents were measured.
+fn errors(log: &Log, file: &TreeModelFile, rows: &[bool], actuator_hz: f64) -> Result<RmsErrors, DiagnoseError> {
+    let candidate = Candidate::of(file)?;
+    let q_rmse_rad = match JointLog::new(log, &file.nominal.tree, |row| rows[row]) {
+        Ok(joint_log) => match evaluate(&joint_log, &candidate, actuator_hz) {
+            Ok((found, _)) => found.q_rmse_rad,
+            Err(InferenceError::Diverges) => None,
+            Err(error) => return Err(error.into()),
+        },
+        // The base is free.
+        Err(InferenceError::NothingToSimulate) => None,
+        Err(error) => return Err(error.into()),
+    };
+    let torque_rmse_nm = torque_error(log, &candidate.robot, |row| rows[row]);
+    Ok(RmsErrors { torque_rmse_nm, q_rmse_rad })
+}
+
+/// Returns the errors due to the noise that the log states.
+fn noise_floor(log: &Log) -> RmsErrors {
+    let mean = |quantity: &str| {
+        let all = log.joints().iter().map(|joint| log.noise(&format!("{quantity}_{joint}")));
+        let squares: Option<Vec<f64>> = all.map(|noise| noise.map(|noise| noise * noise)).collect();
+        squares.map(|squares| (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt())
+    };
+    RmsErrors { torque_rmse_nm: mean("tau_measured"), q_rmse_rad: mean("q") }
+}

@@ -1,0 +1,93 @@
+//! Residuals of a log: measured minus what a robot would have, and what changes of the robot change in them.
+
+use super::block::{Block, Column};
+use super::gaussian::{Cache, Group};
+use super::law::{Law, Place};
+use super::robot::Robot;
+use super::site::Site;
+
+/// State of a joint.
+#[derive(Clone, Copy, Debug)]
+pub struct State {
+    /// Position [rad].
+    pub q: f64,
+    /// Velocity [rad/s].
+    pub dq: f64,
+    /// Torque of the drive [N·m].
+    pub torque: f64,
+}
+
+/// A law at a site that changes a robot.
+pub struct Change<'a> {
+    /// The law.
+    pub law: &'a Law,
+    /// The site.
+    pub site: Site,
+    /// The changed robot.
+    pub after: Robot,
+}
+
+/// Unknowns that are never reported, with narrow priors.
+#[derive(Default)]
+pub struct Small {
+    /// Their columns.
+    pub groups: Vec<Group>,
+    /// Products of the columns.
+    pub cache: Cache,
+}
+
+impl Small {
+    /// Returns unknowns with these columns.
+    pub fn new(groups: Vec<Group>) -> Self {
+        Self { groups, cache: Cache::default() }
+    }
+
+    /// Returns the number of unknowns.
+    pub fn len(&self) -> usize {
+        self.groups.iter().map(|group| group.columns.len()).sum()
+    }
+}
+
+/// Residuals of a log.
+pub trait Residuals: Sync {
+    /// What a robot has, from which residuals and columns are computed.
+    type Predicted: Send + Sync;
+
+    /// Returns the effects of which every joint of a real robot has its own, if a search begins with them.
+    fn usual(&self) -> &[&'static str];
+
+    /// Returns the number of steps of a fit of a candidate.
+    fn trial_steps(&self) -> usize;
+
+    /// Returns the number of steps of a fit that is compared with another one of the same causes.
+    fn fit_steps(&self) -> usize;
+
+    /// Returns the blocks, with any residuals.
+    fn blocks(&self) -> &[Block];
+
+    /// Returns what each robot has.
+    fn predicted(&self, robots: &[Robot]) -> Vec<Self::Predicted>;
+
+    /// Returns the blocks with the residuals of a robot.
+    fn residuals(&self, robot: &Robot, predicted: &Self::Predicted) -> Vec<Block>;
+
+    /// Returns what each change changes of a robot, in the residuals.
+    fn columns(&self, before: (&Robot, &Self::Predicted), changes: &[Change]) -> Vec<Column>;
+
+    /// Returns the small unknowns around a robot.
+    fn small(&self, laws: &[Law], robot: &Robot, predicted: &Self::Predicted) -> Small;
+
+    /// Changes a robot by values of the small unknowns, and the values if they are not possible.
+    ///
+    /// Returns false if the residuals are linear in them: then they stay at zero.
+    fn apply_small(&self, laws: &[Law], robot: &mut Robot, values: &mut [f64]) -> bool;
+
+    /// Returns the equations that tell laws at a joint apart.
+    fn places(&self) -> &[Place];
+
+    /// Returns functions of what a joint measures, in the equations of a law's place, with what each depends on.
+    fn functions(&self, predicted: &Self::Predicted, joint: usize, place: Place) -> Vec<(&'static str, Column)>;
+
+    /// Returns the state of a joint at a time of the log [s].
+    fn state(&self, predicted: &Self::Predicted, joint: usize, t: f64) -> State;
+}
