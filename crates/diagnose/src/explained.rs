@@ -17,10 +17,21 @@ pub const AMBIGUOUS: f64 = 3.0;
 /// Absolute correlation of two estimates from which they are reported.
 const CORRELATED: f64 = 0.9;
 
+/// Share of the squared errors above the noise from which what is left is reported.
+const LEAST_LEFT: f64 = 0.02;
+
 /// Returns the strongest law that the catalogue does not have.
 pub fn unexplained_law(found: &Explained) -> Unexplained {
     let Some(UnknownLaw { joint, of_drive, variable, gain }) = found.unknown.first() else {
-        return unexplained::only_noise();
+        if !found.is_of_positions || found.left < LEAST_LEFT {
+            return unexplained::only_noise();
+        }
+        let text = format!(
+            "The causes leave {:.0} % of the squared position errors above the noise. Torques are not measured, so that their law is not \
+             looked for.",
+            100.0 * found.left
+        );
+        return Unexplained { fraction: found.left, depends_on: Vec::new(), text };
     };
     let channel = if *variable == "t" { "t".to_owned() } else { format!("{variable}_{joint}") };
     let place = if *of_drive { "The torque of the drive" } else { "The torque on the link" };

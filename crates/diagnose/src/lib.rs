@@ -1,5 +1,10 @@
 //! Diagnosis: identifies the effects of the catalogue that a model lacks, by comparison with logs.
 //!
+//! - [`by_equations`]: logs with torques or a fixed base, of a Go2; [`of_tree`]: the same for a robot of any tree; [`explained`]: their
+//!   findings.
+//!
+//! Logs without torques on a free base are searched in simulations:
+//!
 //! - [`data_split`]: rows for fits, in two folds, and held-out blocks of another regime; [`residual_rows`]: residuals
 //!   of these rows; [`residual_power`]: their sums of squares; [`residual_data`]: residuals of motion and torque
 //!   together.
@@ -38,8 +43,8 @@ mod cross_validation;
 mod data_split;
 mod discrimination;
 mod excitation;
-mod explained;
 mod experiment_design;
+mod explained;
 mod explained_variance;
 mod final_fit;
 mod findings;
@@ -88,8 +93,8 @@ pub use findings::{
 };
 use forward_selection::{ForwardSelection, WindowedData, write_estimates};
 use hypothesis::Hypothesis;
-use residual_data::ResidualData;
 pub use of_tree::{TreeDiagnosis, diagnose_tree};
+use residual_data::ResidualData;
 pub use true_law::true_law_gain;
 use twinstep_identify::ExperimentError;
 use twinstep_identify::evaluate::evaluate;
@@ -118,7 +123,9 @@ pub enum DiagnoseError {
     #[error(transparent)]
     TooSlowForMotion(#[from] TooSlowForMotion),
     /// Logs of a robot of any tree differ.
-    #[error("the logs have other joints, torque sensors, rates or base orientations, or one states no gains: diagnose them one by one")]
+    #[error(
+        "the logs have other joints, torque sensors, rates or base orientations, or one states no gains: diagnose them one by one"
+    )]
     Unlike,
     /// A log and a robot of any tree cannot be compared.
     #[error(transparent)]

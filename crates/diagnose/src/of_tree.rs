@@ -5,10 +5,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use twinstep_effects::{JointEffect, JointScope, TreeModelFile};
 use twinstep_inference::equations::{Explanation, explain_tree, torque_error};
-use twinstep_inference::{
-    Candidate, IdentifyOptions, InferenceError, JointLog, ParameterRequest, evaluate, identify,
-};
+use twinstep_inference::{Candidate, IdentifyOptions, InferenceError, JointLog, ParameterRequest, evaluate, identify};
 use twinstep_logs::Log;
+use twinstep_model::TreeModel;
 
 use super::data_split::fitted_rows;
 use super::explained::{confusable, finding, unexplained_law};
@@ -43,10 +42,10 @@ pub fn diagnose_tree(
     let joined = Log::joined(logs).ok_or(DiagnoseError::Unlike)?;
     let is_used: Vec<bool> = logs.iter().flat_map(fitted_rows).collect();
     let held_out: Vec<bool> = logs.iter().flat_map(held_out_rows).collect();
-    let given = with_gains(file, &joined, &is_used, actuator_hz, progress)?;
+    let (given, estimates) = with_gains(file, &joined, &is_used, actuator_hz, progress)?;
     let robot = Candidate::of(&given)?;
     let mut go_on = |text: &str| progress(text);
-    let found = explain_tree(&joined, &robot, actuator_hz, |row| is_used[row], &mut go_on)?;
+    let found = explain_tree(&joined, &robot, estimates.as_ref(), actuator_hz, |row| is_used[row], &mut go_on)?;
     let found = found.ok_or(DiagnoseError::Interrupted)?;
     let joints: Vec<String> = file.nominal.tree.joints.iter().map(|joint| joint.name.clone()).collect();
     let extended = extended(&given, &found.causes, &joints);
@@ -67,17 +66,17 @@ pub fn diagnose_tree(
     Ok(TreeDiagnosis { diagnosis, extended })
 }
 
-/// Returns the model with estimates of the gains that the log does not state.
+/// Returns the model with estimates of the gains that the log does not state, and the robot with what was estimated together with them.
 fn with_gains(
     file: &TreeModelFile,
     log: &Log,
     is_used: &[bool],
     actuator_hz: f64,
     progress: &mut DiagnoseProgress,
-) -> Result<TreeModelFile, DiagnoseError> {
+) -> Result<(TreeModelFile, Option<TreeModel>), DiagnoseError> {
     let stated = |joint: &String| log.gains(joint).iter().all(Option::is_some);
     if log.joints().iter().all(stated) {
-        return Ok(file.clone());
+        return Ok((file.clone(), None));
     }
     // The gains of a long log show in a part of it.
     let block = (BLOCK_S * log.meta().rate_hz).max(1.0) as usize;
@@ -96,7 +95,8 @@ fn with_gains(
     if found.interrupted {
         return Err(DiagnoseError::Interrupted);
     }
-    Ok(TreeModelFile { kp: found.model.kp, kd: found.model.kd, ..file.clone() })
+    let estimates = found.model.tree_model().ok();
+    Ok((TreeModelFile { kp: found.model.kp, kd: found.model.kd, ..file.clone() }, estimates))
 }
 
 /// Returns the model with the causes and their intervals.

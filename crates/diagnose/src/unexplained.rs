@@ -142,17 +142,6 @@ fn heights_of_feet(evidence: &ResidualData, robot: &RobotModel) -> Vec<Residual>
     changing.map(residual).collect()
 }
 
-/// Describes what a residual of a log depends on. The text starts with `whose`.
-pub fn describe_residual(
-    log: &Log,
-    residual: &[f64],
-    variables: &[(String, Vec<f64>)],
-    fraction: f64,
-    whose: &str,
-) -> Unexplained {
-    described(dependences(log, &DataSplit::new(log), residual, variables), fraction, whose)
-}
-
 /// Returns what explains a residual, with the explained fraction of its variance, the strongest first.
 fn dependences(log: &Log, split: &DataSplit, residual: &[f64], variables: &[(String, Vec<f64>)]) -> Vec<(f64, String)> {
     let line = line_of(log, split, residual).map(|(frequency, share)| (share, format!("{LINE} {frequency:.2} Hz")));
@@ -256,6 +245,17 @@ mod tests {
     use twinstep_model::BaseMount;
 
     use super::*;
+
+    /// Describes what a residual of a log depends on. The text starts with `whose`.
+    fn describe_residual(
+        log: &Log,
+        residual: &[f64],
+        variables: &[(String, Vec<f64>)],
+        fraction: f64,
+        whose: &str,
+    ) -> Unexplained {
+        super::described(dependences(log, &DataSplit::new(log), residual, variables), fraction, whose)
+    }
 
     const ROWS: usize = 4000;
 

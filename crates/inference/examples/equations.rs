@@ -1,4 +1,4 @@
-//! Prints what explains logs of a Go2 with motor currents.
+//! Prints what explains logs of a Go2.
 
 use twinstep_inference::equations::explain;
 use twinstep_logs::Log;
@@ -8,16 +8,20 @@ fn main() {
     for path in std::env::args().skip(1) {
         let start = std::time::Instant::now();
         let log = Log::open(&path).expect("a log");
-        let Some(found) = explain(&log, &go2(), |_| true, &mut |line| {
+        let mut say = |line: &str| {
             eprintln!("{:.1} s: {line}", start.elapsed().as_secs_f64());
             true
-        }) else {
-            println!("{path}: the equations need motor currents, velocities and gains of all joints");
-            continue;
+        };
+        let found = match explain(&log, &go2(), |_| true, &mut say) {
+            Ok(found) => found.expect("it is not interrupted"),
+            Err(error) => {
+                println!("{path}: {error}");
+                continue;
+            }
         };
         println!("{path}: {:.1} s", start.elapsed().as_secs_f64());
         for cause in &found.causes {
-            let (name, scope, gain) = (cause.effect.name, cause.scope, cause.gain);
+            let (name, scope, gain) = (cause.effect.name, &cause.scope, cause.gain);
             println!("  {name}@{scope} {gain:.1} nat {:.4?} {:.4?}", cause.values, cause.intervals);
             for own in &cause.by_joint {
                 println!("    {} {:.4?} {:.4?}", own.joint, own.values, own.intervals);

@@ -280,3 +280,43 @@ pub(crate) fn contiguous_ranges<'a>(
         Some(range)
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use twinstep_model::BaseMount;
+
+    use super::*;
+    use crate::TorqueSensor;
+
+    fn log(kp: f64, extra: bool) -> Log {
+        let segment = Segment { name: "air".to_owned(), base: BaseMount::Fixed };
+        let mut meta = Meta::new(200.0, TorqueSensor::None, vec![segment]);
+        (meta.kp, meta.kd) = (Some(Gain::Uniform(kp)), Some(Gain::Uniform(1.0)));
+        let mut columns = BTreeMap::from([
+            ("t".to_owned(), vec![0.0, 0.005]),
+            ("q_elbow".to_owned(), vec![0.1, 0.2]),
+            ("q_cmd_elbow".to_owned(), vec![kp, kp]),
+        ]);
+        if extra {
+            columns.insert("dq_elbow".to_owned(), vec![0.0, 0.0]);
+        }
+        Log::new(meta, columns).expect("a log")
+    }
+
+    #[test]
+    fn joined_logs_keep_their_gains_and_follow_each_other_in_segments_of_their_own() {
+        let joined = Log::joined(&[log(20.0, true), log(30.0, false)]).expect("alike");
+        assert_eq!(joined.gains("elbow")[0], Some(vec![20.0, 20.0, 30.0, 30.0]));
+        assert_eq!(joined.segment(), [0, 0, 1, 1]);
+        assert!(joined.t().windows(2).all(|pair| pair[0] < pair[1]));
+        assert_eq!(joined.q_cmd("elbow"), Some([20.0, 20.0, 30.0, 30.0].as_slice()));
+        assert_eq!(joined.dq("elbow"), None);
+    }
+
+    #[test]
+    fn logs_of_other_joints_are_not_joined() {
+        let mut other = log(20.0, false);
+        other.joints[0] = "knee".to_owned();
+        assert!(Log::joined(&[log(20.0, false), other]).is_none());
+    }
+}

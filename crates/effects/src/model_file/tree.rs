@@ -4,11 +4,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::path::Path;
 
-use toml::{Table, Value};
 use glam::{DAffine3, DMat3, DVec3};
+use toml::{Table, Value};
 use twinstep_model::{
-    FreeJoint, JOINT_NAMES, JointModel, JointSpring, MjcfOptions, NUM_JOINTS, RigidBody, RobotTree, TreeBody, TreeJoint,
-    TreeJointKind, TreeModel, go2, mjcf,
+    FreeJoint, JOINT_NAMES, JointModel, JointSpring, MjcfOptions, NUM_JOINTS, RigidBody, RobotTree, TreeBody,
+    TreeJoint, TreeJointKind, TreeModel, go2, mjcf,
 };
 use twinstep_robot_files::{FileControl, read_robot};
 

@@ -71,6 +71,8 @@ pub struct Explained {
     pub gains_differ: bool,
     /// Laws that the catalogue does not have, the strongest first.
     pub unknown: Vec<UnknownLaw>,
+    /// True if the log has no torques, so that positions were compared.
+    pub is_of_positions: bool,
     /// Decisions of the search, as sentences.
     pub decisions: Vec<String>,
 }
@@ -85,19 +87,23 @@ pub fn explain(
     go_on: &mut dyn FnMut(&str) -> bool,
 ) -> Result<Option<Explained>, InferenceError> {
     let zeros = vec![0.0; robot.joints.len()];
-    let drives = Drives { kp: zeros.clone(), kd: zeros, actuator_hz: robot.control.actuator_hz };
+    let drives = Drives { kp: zeros.clone(), kd: zeros, actuator_hz: robot.control.actuator_hz, estimates: None };
     explain_robot(log, Robot::from(robot), &drives, scopes(), is_used, go_on)
 }
 
 /// Finds what a robot of any tree lacks, as [`explain`] does. Of its bodies nothing is a cause: model files of trees have effects at joints.
+///
+/// `estimates` is a robot with first estimates of friction, inertia and delay, from which a search in simulations begins.
 pub fn explain_tree(
     log: &Log,
     robot: &Candidate,
+    estimates: Option<&TreeModel>,
     actuator_hz: f64,
     is_used: impl Fn(usize) -> bool,
     go_on: &mut dyn FnMut(&str) -> bool,
 ) -> Result<Option<Explained>, InferenceError> {
-    let drives = Drives { kp: robot.kp.clone(), kd: robot.kd.clone(), actuator_hz };
+    let (kp, kd) = (robot.kp.clone(), robot.kd.clone());
+    let drives = Drives { kp, kd, actuator_hz, estimates: estimates.map(|robot| robot.joints.clone()) };
     explain_robot(log, Robot::from(&robot.robot), &drives, scopes_of(&robot.robot.tree), is_used, go_on)
 }
 
@@ -113,7 +119,9 @@ fn explain_robot(
     for law in &mut laws {
         law.is_cause = !log.is_too_slow_for(law.effect);
     }
-    let found = match Measurements::new(log, &robot, &is_used) {
+    let measured = Measurements::new(log, &robot, &is_used);
+    let is_of_positions = measured.is_none();
+    let found = match measured {
         Some(measured) => {
             let system = System::new(measured, &robot);
             let is_balanced = !system.balance.samples.is_empty()
@@ -133,7 +141,7 @@ fn explain_robot(
             Search::new(&positions, &laws, scopes, robot.clone()).run(go_on)
         }
     };
-    Ok(found.map(|found| explained(found, &laws, &robot)))
+    Ok(found.map(|found| Explained { is_of_positions, ..explained(found, &laws, &robot) }))
 }
 
 /// Returns the root mean square error of the torques of a robot's drives, on measured states, in the rows that are used [N·m].
@@ -207,8 +215,7 @@ fn clamped(effect: &Effect, values: Vec<f64>) -> Vec<f64> {
 fn differ(cause: &Cause, found: &FoundCause) -> bool {
     let mean = cause.mean();
     let is_far = |(value, (std, mean)): (&f64, (&f64, &f64))| (value - mean).abs() > TWO_SIDED_95 * std;
-    let of_site =
-        |(values, stds): (&Vec<f64>, &Vec<f64>)| values.iter().zip(stds.iter().zip(&mean)).any(is_far);
+    let of_site = |(values, stds): (&Vec<f64>, &Vec<f64>)| values.iter().zip(stds.iter().zip(&mean)).any(is_far);
     !cause.scope.is_alike || cause.values.iter().zip(&found.site_stds).any(of_site)
 }
 
@@ -223,9 +230,8 @@ fn explained(found: Found, laws: &[Law], robot: &Robot) -> Explained {
         apply(&mut changed, law, site, unknowns, cause.shape);
         clamped(law.effect, changed.tree.bodies[body_of(site)].inertia.log_cholesky().to_vec())
     };
-    let mean_scale = |cause: &Cause| {
-        cause.scope.sites.iter().map(scale_of).sum::<f64>() / cause.scope.sites.len() as f64
-    };
+    let mean_scale =
+        |cause: &Cause| cause.scope.sites.iter().map(scale_of).sum::<f64>() / cause.scope.sites.len() as f64;
     let in_terms = |cause: &Cause| {
         (laws[cause.law].effect, cause.scope.name.clone(), values_at(cause, &cause.mean(), mean_scale(cause)))
     };
@@ -276,6 +282,7 @@ fn explained(found: Found, laws: &[Law], robot: &Robot) -> Explained {
     Explained {
         left: if sum(0) > 0.0 { sum(1) / sum(0) } else { 0.0 },
         gains_differ: found.gains_differ,
+        is_of_positions: false,
         unknown: found.unknown,
         correlations: found.correlations,
         decisions: found.decisions,

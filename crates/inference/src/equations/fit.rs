@@ -60,8 +60,7 @@ impl<R: Residuals> Search<'_, R> {
             let start = self.best_start(&causes, &at, is_added, &earlier.posterior.noise);
             (causes, at, robot, predicted) = (start.causes, start.small, start.robot, Some(start.predicted));
         }
-        let mut predicted =
-            predicted.unwrap_or_else(|| self.system.predicted(std::slice::from_ref(&robot)).remove(0));
+        let mut predicted = predicted.unwrap_or_else(|| self.system.predicted(std::slice::from_ref(&robot)).remove(0));
         let mut iteration = 0;
         loop {
             let mut blocks = self.system.residuals(&robot, &predicted);
@@ -166,10 +165,11 @@ impl<R: Residuals> Search<'_, R> {
         let points: Vec<_> = starts.take(if is_added { 4 } else { 2 }).map(point).collect();
         let robots: Vec<Robot> = points.iter().map(|(_, _, robot)| robot.clone()).collect();
         let cost = |step: &Step<R>| weighted_square(&self.system.residuals(&step.robot, &step.predicted), noise);
-        let steps = points.into_iter().zip(self.system.predicted(&robots)).map(|((causes, small, robot), predicted)| {
-            let step = Step { causes, small, robot, predicted };
-            (cost(&step), step)
-        });
+        let steps =
+            points.into_iter().zip(self.system.predicted(&robots)).map(|((causes, small, robot), predicted)| {
+                let step = Step { causes, small, robot, predicted };
+                (cost(&step), step)
+            });
         steps.min_by(|one, other| one.0.total_cmp(&other.0)).expect("some sizes").1
     }
 
@@ -187,7 +187,10 @@ impl<R: Residuals> Search<'_, R> {
             for ((group, before), now) in groups.iter().zip(causes).zip(moved) {
                 // Means of the groups are relative to the robot.
                 let pairs = now.values.iter().flatten().zip(before.values.iter().flatten());
-                cost += quadratic(std::slice::from_ref(group), &pairs.map(|(now, before)| now - before).collect::<Vec<_>>());
+                cost += quadratic(
+                    std::slice::from_ref(group),
+                    &pairs.map(|(now, before)| now - before).collect::<Vec<_>>(),
+                );
             }
             cost + weighted_square(&self.system.residuals(robot, predicted), &posterior.noise)
         };
@@ -226,7 +229,9 @@ impl<R: Residuals> Search<'_, R> {
         let mut places = Vec::new();
         for (cause, one) in causes.iter().enumerate() {
             let unknowns = one.values[0].len();
-            places.extend((0..one.values.len()).flat_map(|site| (0..unknowns).map(move |unknown| (cause, site, unknown))));
+            places.extend(
+                (0..one.values.len()).flat_map(|site| (0..unknowns).map(move |unknown| (cause, site, unknown))),
+            );
         }
         let change = |(cause, site, unknown): &(usize, usize, usize)| {
             // Relative to the robot with all causes, so that they compose.
@@ -237,7 +242,10 @@ impl<R: Residuals> Search<'_, R> {
         };
         let changes: Vec<Change> = places.iter().map(change).collect();
         let columns = self.system.columns((robot, predicted), &changes);
-        let scaled = columns.iter().zip(&places).map(|(column, (cause, _, unknown))| column.scaled(1.0 / step(*cause, *unknown)));
+        let scaled = columns
+            .iter()
+            .zip(&places)
+            .map(|(column, (cause, _, unknown))| column.scaled(1.0 / step(*cause, *unknown)));
         let mut columns = scaled.collect::<Vec<_>>().into_iter();
         let group = |cause: &Cause| {
             let units = &self.laws[cause.law].units;

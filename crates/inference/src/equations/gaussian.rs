@@ -276,9 +276,21 @@ fn solve(
             }
         }
     }
-    let factor = matrix.cholesky().expect("the prior makes it positive definite");
+    let factor = factored(matrix);
     let mean = prior_mean + factor.solve(&with_residual);
     Solution { mean, factor, with_residual, square }
+}
+
+/// Returns the Cholesky factor of a precision matrix. Rounding may leave it slightly indefinite: then its diagonal grows a little.
+fn factored(matrix: DMatrix<f64>) -> Cholesky<f64, Dyn> {
+    let grown = |share: &f64| {
+        let mut matrix = matrix.clone();
+        for index in 0..matrix.nrows() {
+            matrix[(index, index)] *= 1.0 + share;
+        }
+        matrix.cholesky()
+    };
+    [0.0, 1e-12, 1e-9, 1e-6].iter().find_map(grown).expect("the prior makes it positive definite")
 }
 
 /// Returns shape and variance of highest likelihood, given the posterior of the unknowns.
@@ -461,7 +473,7 @@ mod tests {
             let size = groups.len();
             let (precision, prior_mean, log_prior) = prior(groups, size);
             let members = members(1, groups);
-            let products = vec![products(&blocks[0], &members[0], 0, &Cache::default())];
+            let products = vec![super::products(&blocks[0], &members[0], 0, &Cache::default())];
             let solution = solve(&products, &members, &before.noise, &precision, &prior_mean);
             let shift = &solution.mean - &prior_mean;
             let log_determinant =

@@ -58,8 +58,8 @@ impl<R: Residuals> Search<'_, R> {
             self.system.functions(predicted, joint, law.place).into_iter().map(|(_, column)| column).collect()
         };
         let free = joints.iter().map(|joint| Group::independent(functions(&without.predicted, *joint), unknown::STD));
-        let imitated = self.evidence_with(&without, best, free.collect())
-            + (EFFECT_PROBABILITY * cause.scope.probability).ln();
+        let imitated =
+            self.evidence_with(&without, best, free.collect()) + (EFFECT_PROBABILITY * cause.scope.probability).ln();
         // A law of the catalogue may have a slightly different form.
         let unknowns = law.units.len();
         let near = joints.iter().enumerate().flat_map(|(site, joint)| {
@@ -103,7 +103,13 @@ impl<R: Residuals> Search<'_, R> {
     }
 
     /// Returns an effect times a function of the state, which has no mean over the effect and a root mean square of one, or less.
-    fn modulated(&self, predicted: &R::Predicted, joint: Option<usize>, effect: &Column, function: Modulator) -> Column {
+    fn modulated(
+        &self,
+        predicted: &R::Predicted,
+        joint: Option<usize>,
+        effect: &Column,
+        function: Modulator,
+    ) -> Column {
         let size = root_mean_square(effect).max(1e-12);
         let part = |(block, rows): &(usize, Vec<f64>)| {
             let times = &self.system.blocks()[*block].t;

@@ -1,9 +1,11 @@
-//! Diagnosis by one likelihood, from logs with motor currents: which effects of the catalogue a robot has that its model lacks.
+//! Diagnosis by one likelihood: which effects of the catalogue a robot has that its model lacks.
 //!
 //! - [`explain`]: what explains a log, in the terms of the catalogue.
 //! - [`measurements`]: the channels of a log; [`robot`]: what effects change.
-//! - [`system`]: blocks of residuals without simulation, and the column of any change of the robot. [`drive`]: the torque of each drive;
+//! - [`residuals`]: residuals of a log, and the column of any change of the robot; [`site`]: where changes act.
+//! - [`system`]: residuals of a log with torques, without simulation. [`drive`]: the torque of each drive;
 //!   [`balance`]: the balance of each joint and of the base in [`samples`] of the log, with its [`columns`]; the gyroscope.
+//! - [`positions`]: residuals of a log without torques on a fixed base, by simulation.
 //! - [`gaussian`]: the evidence of residuals that are linear in unknowns with normal priors; [`block`]: the noise that is left.
 //! - [`law`]: an effect with its unknowns. [`nuisance`]: what every robot has a little of.
 //! - [`search`]: the set of causes of highest evidence, by [`screening`] of all effects and a [`fit`] of the best; [`imitations`]: causes that only imitate
@@ -22,6 +24,8 @@ mod law;
 mod measurements;
 mod nuisance;
 mod outcome;
+#[cfg(test)]
+mod position_tests;
 mod positions;
 mod problem;
 mod residuals;

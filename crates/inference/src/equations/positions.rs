@@ -5,7 +5,7 @@
 
 use glam::{DAffine3, DVec3};
 use twinstep_logs::Log;
-use twinstep_model::{CONTACT, RobotTree, TreeModel};
+use twinstep_model::{CONTACT, JointModel, RobotTree, TreeModel};
 
 use super::block::{Block, Column};
 use super::gaussian::Group;
@@ -61,6 +61,8 @@ pub struct Positions {
     limbs: Vec<usize>,
     small: Vec<SmallUnknown>,
     drives: Drives,
+    /// Joints of the given robot.
+    given: Vec<JointModel>,
 }
 
 /// Drives of a robot.
@@ -72,6 +74,8 @@ pub struct Drives {
     pub kd: Vec<f64>,
     /// Rate [Hz].
     pub actuator_hz: f64,
+    /// First estimates of the joints.
+    pub estimates: Option<Vec<JointModel>>,
 }
 
 /// Simulation of a robot, by window.
@@ -91,7 +95,8 @@ impl Positions {
         let log = JointLog::new(log, &robot.tree, is_used)?;
         let mut windows = windows(&log, &robot.tree, WindowLength::IDENTIFICATION);
         let length: f64 = windows.iter().map(|window| log.t[window.rows.end - 1] - log.t[window.rows.start]).sum();
-        let kept = ((MOST_S / log.joints.len() as f64 / length).min(1.0) * windows.len() as f64).ceil().max(1.0) as usize;
+        let kept =
+            ((MOST_S / log.joints.len() as f64 / length).min(1.0) * windows.len() as f64).ceil().max(1.0) as usize;
         let all = windows.len();
         let mut index = 0;
         windows.retain(|_| {
@@ -110,7 +115,7 @@ impl Positions {
         let blocks = log.joints.iter().zip(&rows).map(block).collect();
         let limbs = limbs(&robot.tree);
         let small = small_unknowns(robot, laws, &log);
-        Ok(Self { log, windows, blocks, rows, limbs, small, drives: drives.clone() })
+        Ok(Self { log, windows, blocks, rows, limbs, small, drives: drives.clone(), given: robot.joints.clone() })
     }
 
     fn simulated(&self, robots: &[Robot]) -> Vec<Simulated> {
@@ -125,13 +130,20 @@ impl Positions {
         };
         let candidates: Vec<Candidate> = robots.iter().map(candidate).collect();
         let run = |candidates: &[Candidate]| {
-            simulate(&self.log, &self.windows, candidates, self.drives.actuator_hz, &std::sync::atomic::AtomicBool::new(false))
+            simulate(
+                &self.log,
+                &self.windows,
+                candidates,
+                self.drives.actuator_hz,
+                &std::sync::atomic::AtomicBool::new(false),
+            )
         };
         match run(&candidates) {
             Ok(all) => all.into_iter().map(|traces| Simulated(Some(traces))).collect(),
             // One of them is impossible.
             Err(_) => {
-                let alone = |one: &Candidate| Simulated(run(std::slice::from_ref(one)).ok().map(|mut all| all.remove(0)));
+                let alone =
+                    |one: &Candidate| Simulated(run(std::slice::from_ref(one)).ok().map(|mut all| all.remove(0)));
                 candidates.iter().map(alone).collect()
             }
         }
@@ -201,8 +213,18 @@ impl Positions {
 impl Residuals for Positions {
     type Predicted = Simulated;
 
-    fn usual(&self) -> &[&'static str] {
-        &["coulomb_friction", "viscous_friction", "armature", "command_delay"]
+    fn usual(&self) -> Vec<(&'static str, Option<Vec<f64>>)> {
+        let estimates: [(&str, fn(&JointModel) -> f64); 4] = [
+            ("coulomb_friction", |joint| joint.coulomb_friction),
+            ("viscous_friction", |joint| joint.viscous_friction),
+            ("armature", |joint| joint.armature),
+            ("command_delay", |joint| joint.actuator.command_delay),
+        ];
+        let start = |of: fn(&JointModel) -> f64| {
+            let pairs = self.drives.estimates.as_ref()?.iter().zip(&self.given);
+            Some(pairs.map(|(now, before)| (of(now) - of(before)).max(0.0)).collect())
+        };
+        estimates.map(|(name, of)| (name, start(of))).to_vec()
     }
 
     fn trial_steps(&self) -> usize {

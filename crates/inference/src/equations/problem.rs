@@ -36,15 +36,7 @@ pub struct Rivals {
 impl<'a, R: Residuals> Search<'a, R> {
     /// Prepares a search for what `base` lacks.
     pub fn new(system: &'a R, laws: &'a [Law], scopes: Vec<ScopeSites>, base: Robot) -> Self {
-        Self {
-            system,
-            laws,
-            scopes,
-            base,
-            decisions: Vec::new(),
-            removed: Vec::new(),
-            rivals: Vec::new(),
-        }
+        Self { system, laws, scopes, base, decisions: Vec::new(), removed: Vec::new(), rivals: Vec::new() }
     }
 }
 

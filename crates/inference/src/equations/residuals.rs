@@ -53,8 +53,9 @@ pub trait Residuals: Sync {
     /// What a robot has, from which residuals and columns are computed.
     type Predicted: Send + Sync;
 
-    /// Returns the effects of which every joint of a real robot has its own, if a search begins with them.
-    fn usual(&self) -> &[&'static str];
+    /// Returns the effects of which every joint of a real robot has its own, if a search begins with them, and from where: their first
+    /// parameter at each joint, if it is known.
+    fn usual(&self) -> Vec<(&'static str, Option<Vec<f64>>)>;
 
     /// Returns the number of steps of a fit of a candidate.
     fn trial_steps(&self) -> usize;

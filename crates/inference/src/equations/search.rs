@@ -7,8 +7,8 @@ use super::fit::Fitted;
 use super::nuisance;
 use super::outcome::TWO_SIDED_95;
 use super::problem::{EFFECT_PROBABILITY, Rivals, Search, power};
-use super::screening::{LARGE, PRESENT};
 use super::residuals::Residuals;
+use super::screening::{LARGE, PRESENT};
 use super::site::Site;
 
 /// Gain of the evidence above which a cause is added or kept [nat].
@@ -112,11 +112,19 @@ impl<R: Residuals> Search<'_, R> {
         let usual = self.system.usual();
         let scope = self.scopes.iter().filter(|scope| !scope.is_alike).max_by_key(|scope| scope.sites.len()).cloned();
         let (Some(scope), false) = (scope, usual.is_empty()) else { return Some(best) };
-        let cause = |name: &&str| {
+        let cause = |(name, start): &(&str, Option<Vec<f64>>)| {
             let law = self.laws.iter().position(|law| law.effect.name == *name).expect("a law of the catalogue");
             let strengths = self.laws[law].strengths.len().max(1) as f64;
             let log_prior = EFFECT_PROBABILITY.ln() + scope.probability.ln() + std::f64::consts::LN_2 - strengths.ln();
-            let values = vec![vec![0.1 * self.laws[law].units[0]]; scope.sites.len()];
+            let little = 0.1 * self.laws[law].units[0];
+            let value = |site: &Site| match (site, start) {
+                (Site::Joint(joint), Some(start)) => {
+                    let one = self.laws[law].parameters(&[1.0], self.laws[law].shapes[0], self.base.scale[*joint])[0];
+                    (start[*joint] / one).max(1e-3)
+                }
+                _ => little,
+            };
+            let values = scope.sites.iter().map(|site| vec![value(site)]).collect();
             Cause { law, scope: scope.clone(), shape: self.laws[law].shapes[0], values, log_prior }
         };
         let causes: Vec<Cause> = usual.iter().map(cause).collect();
@@ -124,7 +132,8 @@ impl<R: Residuals> Search<'_, R> {
             return None;
         }
         let all = self.fit(causes, &best.small, USUAL_STEPS, Some(&best));
-        self.note(format!("{} at each joint: {:.1} nat", usual.join(", "), all.evidence - best.evidence));
+        let names: Vec<&str> = usual.iter().map(|(name, _)| *name).collect();
+        self.note(format!("{} at each joint: {:.1} nat", names.join(", "), all.evidence - best.evidence));
         for cause in &all.causes {
             self.note(format!("  {}: {:.4?}", self.name(cause), cause.values));
         }

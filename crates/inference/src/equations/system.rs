@@ -9,8 +9,8 @@ use super::block::{Block, Column};
 use super::drive::{link_torque, sensed_torque};
 use super::gaussian::Group;
 use super::law::{Law, Place};
-use super::nuisance;
 use super::measurements::{JointRows, Measurements, Regime};
+use super::nuisance;
 use super::residuals::{Change, Residuals, Small, State};
 use super::robot::Robot;
 use super::samples::Sample;
@@ -347,8 +347,8 @@ fn gyro_blocks(measured: &Measurements, blocks: &mut Vec<Block>) -> Vec<(usize, 
 impl Residuals for System {
     type Predicted = Predicted;
 
-    fn usual(&self) -> &[&'static str] {
-        &[]
+    fn usual(&self) -> Vec<(&'static str, Option<Vec<f64>>)> {
+        Vec::new()
     }
 
     fn trial_steps(&self) -> usize {

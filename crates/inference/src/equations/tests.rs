@@ -11,9 +11,9 @@ use super::causes::{Cause, ScopeSites};
 use super::law::{Law, Place, laws};
 use super::measurements::Measurements;
 use super::problem::Search;
+use super::residuals::Small;
 use super::robot::Robot;
 use super::search::LEAST_GAIN;
-use super::residuals::Small;
 use super::site::{Site, apply};
 use super::system::System;
 
@@ -60,10 +60,14 @@ fn columns() -> BTreeMap<String, Vec<f64>> {
 }
 
 fn log_of(columns: BTreeMap<String, Vec<f64>>) -> Log {
+    log_with(columns, TorqueSensor::MotorCurrent)
+}
+
+fn log_with(columns: BTreeMap<String, Vec<f64>>, sensor: TorqueSensor) -> Log {
     let segment = |name: &str, base| Segment { name: name.to_owned(), base };
     let on_ground = ["sway", "trot"].map(|name| segment(name, BaseMount::Floating));
     let segments = [vec![segment("air", BaseMount::Fixed)], on_ground.to_vec()].concat();
-    let mut meta = Meta::new(200.0, TorqueSensor::MotorCurrent, segments);
+    let mut meta = Meta::new(200.0, sensor, segments);
     (meta.kp, meta.kd) = (Some(Gain::Uniform(30.0)), Some(Gain::Uniform(0.8)));
     Log::new(meta, columns).expect("a log")
 }
@@ -122,7 +126,13 @@ fn gain_below_its_bound_is_not_allowed() {
 
 #[test]
 fn column_of_every_law_is_what_a_small_effect_takes_from_the_residuals() {
-    let (system, robot) = system();
+    for sensor in [TorqueSensor::MotorCurrent, TorqueSensor::JointOutput] {
+        check_columns(&log_with(columns(), sensor));
+    }
+}
+
+fn check_columns(log: &Log) {
+    let (system, robot) = system_of(log);
     let (predicted, before) = (system.predicted(&robot), residuals(&system, &robot));
     for law in laws() {
         for unknown in 0..law.units.len() {
@@ -136,6 +146,25 @@ fn column_of_every_law_is_what_a_small_effect_takes_from_the_residuals() {
             assert!(difference <= 0.05 * size + 1e-9, "{} {unknown}: {difference} of {size}", law.effect.name);
         }
     }
+}
+
+/// Friction between motor and sensor changes what the sensor reads, and no balance of the link.
+#[test]
+fn friction_is_seen_by_a_sensor_at_the_output_and_by_the_balance_if_the_current_is_measured() {
+    let seen = |sensor: TorqueSensor| {
+        let (system, robot) = system_of(&log_with(columns(), sensor));
+        let all = laws();
+        let law = all.iter().find(|law| law.effect.name == "coulomb_friction").expect("a law");
+        let mut after = robot.clone();
+        apply(&mut after, law, Site::Joint(4), &[0.5], 0.0);
+        let column = system.column(law, Site::Joint(4), (&robot, &system.predicted(&robot)), &after);
+        let names = column.parts.iter().filter(|(_, rows)| rows.iter().any(|row| *row != 0.0));
+        let names: Vec<String> = names.map(|(block, _)| system.blocks[*block].name.clone()).collect();
+        names
+    };
+    assert!(seen(TorqueSensor::MotorCurrent).iter().all(|name| !name.starts_with("torque")));
+    let at_output = seen(TorqueSensor::JointOutput);
+    assert!(!at_output.is_empty() && at_output.iter().all(|name| name.starts_with("torque")), "{at_output:?}");
 }
 
 /// A robot with a hundredth less torque and less of all masses lacks exactly as much.
