@@ -24,14 +24,14 @@ use twinstep_report::write_report;
 
 /// Find the effects that a robot model lacks, estimate their parameters and write the corrected model.
 ///
-/// The rows of a log with torques are compared with the equations of its drives, joints and base, without simulation. Of a log
-/// without torques the rows with a fixed base are simulated. Causes are the effects of the catalogue with the highest evidence,
-/// beside everything that each robot has a little of. findings.json has each decision. If no effect of the catalogue is the cause,
-/// the report states what the residual depends on. If the log shows torques, or its base is fixed, an ensemble of networks then
-/// learns the missing torque. It is kept if it reduces the error on held-out blocks by a fifth; extended.toml adds it to the laws
-/// (`[actuator] mode = "residual"`).
+/// Logs with motor currents are compared with the equations of drives, joints and base, without simulation. Causes are the effects of
+/// the catalogue with the highest evidence, beside everything that each robot has a little of. findings.json has each decision. If no
+/// effect of the catalogue is the cause, the report states what the residual depends on. If the log shows torques, or its base is
+/// fixed, an ensemble of networks then learns the missing torque. It is kept if it reduces the error on held-out blocks by a fifth;
+/// extended.toml adds it to the laws (`[actuator] mode = "residual"`).
 ///
-/// Logs without torques on a free base are searched in simulations of all hypotheses, which is slower and less reliable.
+/// Logs of a Go2 without motor currents are searched in simulations: every effect is tested on every joint, leg, side and joint type,
+/// fitted to one fold of the log and evaluated on the other. That takes minutes, and is less reliable.
 ///
 /// DIR gets report.html for a browser, findings.json for programs and extended.toml, the corrected model, which
 /// `twinstep serve --model` loads. motion_before.html and motion_after.html play the first 20 s of the log, with the
@@ -40,7 +40,8 @@ use twinstep_report::write_report;
 /// both logs together.
 ///
 /// For a robot that is not like the Go2, give its URDF, MJCF or model file with --model: DIR gets findings.json and extended.toml.
-/// Gains that no file states are estimated first. Without --model only the drives are compared: that needs torques.
+/// Torques may be those of motors or at the output. Without torques, the base must be fixed: positions are compared. Gains that no
+/// file states are estimated first. Without --model only the drives are compared: that needs torques.
 ///
 /// Example: `twinstep diagnose data/go2_air_chirp --out diagnosis`
 #[derive(clap::Args)]

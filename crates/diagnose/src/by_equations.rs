@@ -1,4 +1,4 @@
-//! Diagnosis of logs with motor currents or with a fixed base: the causes are those of highest evidence in the equations of the logs.
+//! Diagnosis of logs of a Go2 with motor currents: the causes are those of highest evidence in the equations of the logs.
 //!
 //! [`twinstep_inference::equations`] finds them in the rows that are not held out. Simulations estimate the gains of
 //! the joints where the equations show that they differ, measure the errors in the held-out rows, and choose the next experiment.
@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use twinstep_effects::{Composition, Effect, EffectEntry, EntryError, ModelFile, Scope};
 use twinstep_identify::window::WindowConfig;
 use twinstep_inference::equations::{Explanation, explain};
-use twinstep_logs::Log;
+use twinstep_logs::{Log, TorqueSensor};
 use twinstep_model::{JOINT_NAMES, Joint, Rollout};
 
 use super::cross_validation::{Accepted, CandidateFit};
@@ -20,7 +20,8 @@ use super::joint_gains::JointGains;
 use super::residual_data::ResidualData;
 use super::{DiagnoseError, DiagnosisOutput, errors, experiment_design, held_out_rows, reporting, unexplained};
 
-/// Diagnoses the logs of one robot. Returns `None` if the equations do not apply to them: they have neither motor currents nor a fixed base.
+/// Diagnoses the logs of one robot. Returns `None` if the equations do not apply to them: they have no motor currents, or the robot neither
+/// hangs nor stands.
 pub fn diagnose_by_equations(
     logs: &[Log],
     model: &ModelFile,
@@ -29,6 +30,9 @@ pub fn diagnose_by_equations(
 ) -> Result<Option<DiagnosisOutput>, DiagnoseError> {
     let robot = model.robot_model()?;
     let Some(joined) = Log::joined(logs) else { return Ok(None) };
+    if joined.meta().tau_sensor != TorqueSensor::MotorCurrent {
+        return Ok(None);
+    }
     let held_out: Vec<Vec<bool>> = logs.iter().map(held_out_rows).collect();
     let is_used: Vec<bool> = logs.iter().flat_map(fitted_rows).collect();
     let mut interrupted = Ok(());

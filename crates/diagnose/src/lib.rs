@@ -1,9 +1,8 @@
 //! Diagnosis: identifies the effects of the catalogue that a model lacks, by comparison with logs.
 //!
-//! - [`by_equations`]: logs with torques or a fixed base, of a Go2; [`of_tree`]: the same for a robot of any tree; [`explained`]: their
-//!   findings.
+//! - [`by_equations`]: logs of a Go2 with motor currents; [`of_tree`]: logs of a robot of any tree; [`explained`]: their findings.
 //!
-//! Logs without torques on a free base are searched in simulations:
+//! Other logs of a Go2 are searched in simulations:
 //!
 //! - [`data_split`]: rows for fits, in two folds, and held-out blocks of another regime; [`residual_rows`]: residuals
 //!   of these rows; [`residual_power`]: their sums of squares; [`residual_data`]: residuals of motion and torque

@@ -21,8 +21,9 @@ use crate::{Candidate, InferenceError};
 const LAW_ERROR: f64 = 0.015;
 /// Prior probability that each joint of all, or of a type, has its own value.
 const EACH: f64 = 0.1;
-/// Variants of a law that are tried where each is a simulation.
-const FEW: usize = 6;
+/// Strengths and shapes of a law that are tried where each is a simulation.
+const MOST_STRENGTHS: usize = 6;
+const MOST_SHAPES: usize = 24;
 /// Variance that is left in an equation, relative to that of its noise, which wrong statements about the noise allow.
 const UNEXPLAINED: f64 = 2.0;
 
@@ -126,6 +127,9 @@ fn explain_robot(
             let system = System::new(measured, &robot);
             let is_balanced = !system.balance.samples.is_empty()
                 && (system.measured.regime.contains(&Regime::Hang) || system.balance.stands());
+            if !is_balanced && !robot.feet.is_empty() {
+                return Err(InferenceError::NothingToSimulate);
+            }
             for law in laws.iter_mut().filter(|_| !is_balanced) {
                 let is_of_joint = law.place == Place::Joint && system.measured.is_at_output;
                 law.is_cause &= matches!(law.place, Place::Drive | Place::Supply) || is_of_joint;
@@ -156,11 +160,11 @@ pub fn torque_error(log: &Log, robot: &TreeModel, is_used: impl Fn(usize) -> boo
     (count > 0.0).then(|| (sum / count).sqrt())
 }
 
-/// Leaves every third variant of a law: each is a simulation.
+/// Leaves some of the variants of a law: each is a simulation.
 fn few_variants(law: &mut Law) {
-    for variants in [&mut law.strengths, &mut law.shapes] {
-        if variants.len() > FEW {
-            *variants = variants.iter().copied().skip(1).step_by(variants.len() / FEW).collect();
+    for (variants, most) in [(&mut law.strengths, MOST_STRENGTHS), (&mut law.shapes, MOST_SHAPES)] {
+        if variants.len() > most {
+            *variants = variants.iter().copied().skip(1).step_by(variants.len() / most).collect();
         }
     }
 }

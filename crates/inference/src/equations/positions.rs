@@ -227,6 +227,10 @@ impl Residuals for Positions {
         estimates.map(|(name, of)| (name, start(of))).to_vec()
     }
 
+    fn is_simulated(&self) -> bool {
+        true
+    }
+
     fn trial_steps(&self) -> usize {
         2
     }

@@ -57,6 +57,9 @@ pub trait Residuals: Sync {
     /// parameter at each joint, if it is known.
     fn usual(&self) -> Vec<(&'static str, Option<Vec<f64>>)>;
 
+    /// Returns true if each column is a simulation, so that few are computed.
+    fn is_simulated(&self) -> bool;
+
     /// Returns the number of steps of a fit of a candidate.
     fn trial_steps(&self) -> usize;
 

@@ -34,7 +34,12 @@ struct Candidate {
 impl<R: Residuals> Search<'_, R> {
     /// Returns the best candidates for a further cause, with their gains at the noise of the current fit.
     pub fn screen(&self, best: &Fitted<R>) -> Vec<(f64, Cause)> {
-        let candidates = self.candidates(best);
+        self.screen_at(best, None)
+    }
+
+    /// Returns the best candidates at some sites, or at all.
+    pub fn screen_at(&self, best: &Fitted<R>, only: Option<&[Site]>) -> Vec<(f64, Cause)> {
+        let candidates = self.candidates(best, only);
         let columns: Vec<&Column> = candidates.iter().map(|candidate| &candidate.column).collect();
         let groups: Vec<&Group> = best.small.groups.iter().chain(&best.groups).collect();
         let scores = Scores::new(&best.blocks, &groups, &best.posterior, &columns);
@@ -47,7 +52,7 @@ impl<R: Residuals> Search<'_, R> {
                 if own.is_empty() {
                     continue;
                 }
-                hypotheses.extend(self.hypotheses(law, shape, &own, &candidates, &scores, best));
+                hypotheses.extend(self.hypotheses(law, shape, &own, &candidates, &scores, best, only));
             }
         }
         hypotheses.sort_by(|one, other| other.0.total_cmp(&one.0));
@@ -74,10 +79,11 @@ impl<R: Residuals> Search<'_, R> {
         self.laws[law].strengths.len().max(self.laws[law].shapes.len())
     }
 
-    fn candidates(&self, best: &Fitted<R>) -> Vec<Candidate> {
+    fn candidates(&self, best: &Fitted<R>, only: Option<&[Site]>) -> Vec<Candidate> {
         let mut all: Vec<(usize, usize, Site, usize)> = Vec::new();
         for (index, law) in self.laws.iter().enumerate() {
             let mut sites: Vec<Site> = self.scopes_of(law).flat_map(|scope| scope.sites.iter().copied()).collect();
+            sites.retain(|site| only.is_none_or(|only| only.contains(site)));
             sites.sort();
             sites.dedup();
             for site in sites {
@@ -127,6 +133,7 @@ impl<R: Residuals> Search<'_, R> {
         candidates: &[Candidate],
         scores: &Scores,
         best: &Fitted<R>,
+        only: Option<&[Site]>,
     ) -> Vec<(f64, Cause)> {
         let law = &self.laws[law_index];
         let products = DMatrix::from_fn(own.len(), own.len(), |row, column| {
@@ -140,7 +147,8 @@ impl<R: Residuals> Search<'_, R> {
                     && cause.scope.sites.iter().any(|site| scope.sites.contains(site))
             };
             let removed = |(law, name): &(usize, String)| *law == law_index && *name == scope.label();
-            if best.causes.iter().any(known) || self.removed.iter().any(removed) {
+            let is_beyond = only.is_some_and(|only| scope.sites.iter().any(|site| !only.contains(site)));
+            if is_beyond || best.causes.iter().any(known) || self.removed.iter().any(removed) {
                 continue;
             }
             let members: Vec<usize> =

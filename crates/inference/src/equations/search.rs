@@ -17,6 +17,12 @@ pub const LEAST_GAIN: f64 = 3.0;
 const OTHER_SCOPES: usize = 3;
 /// Steps of the fit of what every joint has its own of.
 const USUAL_STEPS: usize = 8;
+/// Candidates whose fit is finished before one of them is added, where a fit is a simulation.
+const FINISHED: usize = 3;
+/// Candidates that are tried in the place of a cause.
+const RIVALS: usize = 2;
+/// Evidence by which another cause must be better to take the place of one [nat]: fits end so close to their best values.
+const LEAST_BETTER: f64 = 10.0;
 /// Most causes.
 const MOST_CAUSES: usize = 6;
 /// Causes that were added and removed again, after which the search ends.
@@ -56,6 +62,13 @@ impl<R: Residuals> Search<'_, R> {
             }
             let mut fits: Vec<Fitted<R>> = fits.into_iter().map(|(_, fit)| fit).filter(|fit| fit.is_possible).collect();
             fits.sort_by(|one, other| other.evidence.total_cmp(&one.evidence));
+            if self.system.is_simulated() {
+                // A few steps do not tell what comes out.
+                for fit in fits.iter_mut().take(FINISHED).filter(|fit| fit.evidence > best.evidence + LEAST_GAIN) {
+                    *fit = self.fit(fit.causes.clone(), &fit.small, self.system.fit_steps(), Some(fit));
+                }
+                fits.sort_by(|one, other| other.evidence.total_cmp(&one.evidence));
+            }
             let mut fits = fits.into_iter();
             let Some(next) = fits.next() else { break };
             let rival = |fit: Fitted<R>| (fit.causes[fit.causes.len() - 1].clone(), fit.evidence - next.evidence);
@@ -80,6 +93,7 @@ impl<R: Residuals> Search<'_, R> {
             best = self.fit(best.causes.clone(), &small, self.system.fit_steps(), Some(&best));
             let last = best.causes.len() - 1;
             best = self.with_best_scope(best, last);
+            best = self.with_best_shape(best, last);
             if !best.is_possible {
                 best = self.without_last(best);
             }
@@ -87,6 +101,9 @@ impl<R: Residuals> Search<'_, R> {
         }
         if !go_on(&self.progress(&best)) {
             return None;
+        }
+        if self.system.is_simulated() {
+            best = self.with_rivals(best, go_on)?;
         }
         best = self.without_imitations(best);
         Some(self.found(best, &given))
@@ -199,6 +216,68 @@ impl<R: Residuals> Search<'_, R> {
             }
         }
         best
+    }
+
+    /// Tries shapes between those of the screening, where it had only some of them.
+    fn with_best_shape(&mut self, mut best: Fitted<R>, place: usize) -> Fitted<R> {
+        let shapes = &self.laws[best.causes[place].law].shapes;
+        if !self.system.is_simulated() || shapes.len() < 2 {
+            return best;
+        }
+        let spacing = shapes[1] - shapes[0];
+        for share in [0.5, 0.25] {
+            for side in [-1.0, 1.0] {
+                let mut causes = best.causes.clone();
+                causes[place].shape += side * share * spacing;
+                let other = self.fit(causes, &best.small, self.system.trial_steps(), Some(&best));
+                if other.is_possible && other.evidence > best.evidence {
+                    best = other;
+                    break;
+                }
+            }
+        }
+        best
+    }
+
+    /// Compares each cause with others on its sites, and replaces it by one that is better.
+    fn with_rivals(&mut self, mut best: Fitted<R>, go_on: &mut dyn FnMut(&str) -> bool) -> Option<Fitted<R>> {
+        for place in 0..best.causes.len() {
+            let mut others = best.causes.clone();
+            let cause = others.remove(place);
+            let name = self.name(&cause);
+            let without = self.fit(others, &best.small, self.system.trial_steps(), Some(&best));
+            let candidates = self.screen_at(&without, Some(&cause.scope.sites));
+            let mut fits: Vec<Fitted<R>> = Vec::new();
+            for (_, rival) in candidates.into_iter().filter(|(_, one)| one.law != cause.law).take(RIVALS) {
+                if !go_on(&format!("{}, trying {} in place of {name}", self.progress(&best), self.name(&rival))) {
+                    return None;
+                }
+                let causes = [without.causes.as_slice(), &[rival]].concat();
+                let fit = self.fit(causes, &without.small, self.system.fit_steps(), Some(&without));
+                let line = format!(
+                    "  {} in place of {name}: {:.1} nat",
+                    self.name(&fit.causes[fit.causes.len() - 1]),
+                    fit.evidence - best.evidence
+                );
+                self.note(line);
+                fits.push(fit);
+            }
+            fits.retain(|fit| fit.is_possible);
+            fits.sort_by(|one, other| other.evidence.total_cmp(&one.evidence));
+            let mut replaced = cause;
+            if fits.first().is_some_and(|fit| fit.evidence > best.evidence + LEAST_BETTER) {
+                let mut better = fits.remove(0);
+                // In the place of the other one.
+                let added = better.causes.len() - 1;
+                better.causes.swap(place, added);
+                replaced = better.causes[place].clone();
+                best = self.fit(better.causes.clone(), &better.small, self.system.trial_steps(), Some(&better));
+            }
+            let rival = |fit: &Fitted<R>| (fit.causes[fit.causes.len() - 1].clone(), fit.evidence - best.evidence);
+            let others = fits.iter().map(rival).collect();
+            self.rivals.push(Rivals { law: replaced.law, scope: replaced.scope.label(), others });
+        }
+        Some(best)
     }
 
     /// Removes the cause that was added last, because its best parameters are not possible.

@@ -351,6 +351,10 @@ impl Residuals for System {
         Vec::new()
     }
 
+    fn is_simulated(&self) -> bool {
+        false
+    }
+
     fn trial_steps(&self) -> usize {
         3
     }
