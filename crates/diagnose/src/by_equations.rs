@@ -20,8 +20,8 @@ use super::joint_gains::JointGains;
 use super::residual_data::ResidualData;
 use super::{DiagnoseError, DiagnosisOutput, errors, experiment_design, held_out_rows, reporting, unexplained};
 
-/// Diagnoses the logs of one robot. Returns `None` if the equations do not apply to them: they have no motor currents, or the robot neither
-/// hangs nor stands.
+/// Diagnoses the logs of one robot. Returns `None` if the equations do not apply to them: they have no motor currents, or the robot does
+/// not hang, and stand where its base moves.
 pub fn diagnose_by_equations(
     logs: &[Log],
     model: &ModelFile,

@@ -80,7 +80,8 @@ pub struct Explained {
 
 /// Finds what a quadruped lacks, from the rows of `log` that are used. `go_on` gets a line of progress.
 ///
-/// Returns `None` if `go_on` returned false. Fails if the log has neither motor currents nor a fixed base.
+/// Returns `None` if `go_on` returned false. Fails if the log has neither torques nor a fixed base, or if
+/// the base moves, and the robot does not both hang and stand on all feet in some rows.
 pub fn explain(
     log: &Log,
     robot: &RobotModel,
@@ -122,28 +123,26 @@ fn explain_robot(
     }
     let measured = Measurements::new(log, &robot, &is_used);
     let is_of_positions = measured.is_none();
-    let found = match measured {
-        Some(measured) => {
-            let system = System::new(measured, &robot);
-            let is_balanced = !system.balance.samples.is_empty()
-                && (system.measured.regime.contains(&Regime::Hang) || system.balance.stands());
-            if !is_balanced && !robot.feet.is_empty() {
-                return Err(InferenceError::NothingToSimulate);
-            }
-            for law in laws.iter_mut().filter(|_| !is_balanced) {
-                let is_of_joint = law.place == Place::Joint && system.measured.is_at_output;
-                law.is_cause &= matches!(law.place, Place::Drive | Place::Supply) || is_of_joint;
-            }
-            Search::new(&system, &laws, scopes, robot.clone()).run(go_on)
+    let found = if let Some(measured) = measured {
+        let system = System::new(measured, &robot);
+        let hangs = system.measured.regime.contains(&Regime::Hang);
+        let is_free = system.measured.regime.iter().any(|regime| *regime != Regime::Hang);
+        if is_free && !(hangs && system.balance.stands()) && !robot.feet.is_empty() {
+            return Err(InferenceError::NothingToSimulate);
         }
-        None => {
-            for law in &mut laws {
-                law.is_cause &= is_simulated(law);
-                few_variants(law);
-            }
-            let positions = Positions::new(log, &robot, &laws, &is_used, drives)?;
-            Search::new(&positions, &laws, scopes, robot.clone()).run(go_on)
+        let is_balanced = hangs && !system.balance.samples.is_empty();
+        for law in laws.iter_mut().filter(|_| !is_balanced) {
+            let is_of_joint = law.place == Place::Joint && system.measured.is_at_output;
+            law.is_cause &= matches!(law.place, Place::Drive | Place::Supply) || is_of_joint;
         }
+        Search::new(&system, &laws, scopes, robot.clone()).run(go_on)
+    } else {
+        for law in &mut laws {
+            law.is_cause &= is_simulated(law);
+            few_variants(law);
+        }
+        let positions = Positions::new(log, &robot, &laws, &is_used, drives)?;
+        Search::new(&positions, &laws, scopes, robot.clone()).run(go_on)
     };
     Ok(found.map(|found| Explained { is_of_positions, ..explained(found, &laws, &robot) }))
 }

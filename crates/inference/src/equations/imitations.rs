@@ -59,7 +59,7 @@ impl<R: Residuals> Search<'_, R> {
         };
         let free = joints.iter().map(|joint| Group::independent(functions(&without.predicted, *joint), unknown::STD));
         let imitated =
-            self.evidence_with(&without, best, free.collect()) + (EFFECT_PROBABILITY * cause.scope.probability).ln();
+            Self::evidence_with(&without, best, free.collect()) + (EFFECT_PROBABILITY * cause.scope.probability).ln();
         // A law of the catalogue may have a slightly different form.
         let unknowns = law.units.len();
         let near = joints.iter().enumerate().flat_map(|(site, joint)| {
@@ -71,7 +71,7 @@ impl<R: Residuals> Search<'_, R> {
             };
             functions(&best.predicted, *joint).into_iter().map(group)
         });
-        let named = self.evidence_with(best, best, near.collect());
+        let named = Self::evidence_with(best, best, near.collect());
         (without, Some(imitated - named))
     }
 
@@ -96,7 +96,7 @@ impl<R: Residuals> Search<'_, R> {
             return f64::NEG_INFINITY;
         }
         let count = changes.len();
-        let found = self.posterior_with(best, best, vec![Group::independent(changes, FORM_CHANGE[0])]);
+        let found = Self::posterior_with(best, best, vec![Group::independent(changes, FORM_CHANGE[0])]);
         let first = found.mean.len() - count;
         let gain = |index: usize| gain_of_change(found.mean[index], found.covariance[(index, index)]);
         (first..first + count).map(gain).fold(f64::NEG_INFINITY, f64::max) + UNKNOWN_PROBABILITY.ln()
@@ -137,12 +137,12 @@ impl<R: Residuals> Search<'_, R> {
     }
 
     /// Returns the evidence of a fit with further unknowns, with the noise of `best`.
-    fn evidence_with(&self, fit: &Fitted<R>, best: &Fitted<R>, further: Vec<Group>) -> f64 {
+    fn evidence_with(fit: &Fitted<R>, best: &Fitted<R>, further: Vec<Group>) -> f64 {
         let log_prior: f64 = fit.causes.iter().map(|cause| cause.log_prior).sum();
-        self.posterior_with(fit, best, further).evidence + log_prior
+        Self::posterior_with(fit, best, further).evidence + log_prior
     }
 
-    fn posterior_with(&self, fit: &Fitted<R>, best: &Fitted<R>, further: Vec<Group>) -> Posterior {
+    fn posterior_with(fit: &Fitted<R>, best: &Fitted<R>, further: Vec<Group>) -> Posterior {
         let groups: Vec<Group> = fit.groups.iter().cloned().chain(further).collect();
         posterior(&fit.blocks, [&fit.small.groups, &groups], Some(&best.posterior.noise), &fit.small.cache)
     }

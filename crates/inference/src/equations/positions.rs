@@ -78,6 +78,9 @@ pub struct Drives {
     pub estimates: Option<Vec<JointModel>>,
 }
 
+/// Returns a parameter of a joint.
+type Parameter = fn(&JointModel) -> f64;
+
 /// Simulation of a robot, by window.
 pub struct Simulated(Option<Vec<Trace>>);
 
@@ -138,15 +141,12 @@ impl Positions {
                 &std::sync::atomic::AtomicBool::new(false),
             )
         };
-        match run(&candidates) {
-            Ok(all) => all.into_iter().map(|traces| Simulated(Some(traces))).collect(),
-            // One of them is impossible.
-            Err(_) => {
-                let alone =
-                    |one: &Candidate| Simulated(run(std::slice::from_ref(one)).ok().map(|mut all| all.remove(0)));
-                candidates.iter().map(alone).collect()
-            }
+        if let Ok(all) = run(&candidates) {
+            return all.into_iter().map(|traces| Simulated(Some(traces))).collect();
         }
+        // One of them is impossible.
+        let alone = |one: &Candidate| Simulated(run(std::slice::from_ref(one)).ok().map(|mut all| all.remove(0)));
+        candidates.iter().map(alone).collect()
     }
 
     /// Returns a simulated position of a joint of the log in its compared rows.
@@ -214,13 +214,13 @@ impl Residuals for Positions {
     type Predicted = Simulated;
 
     fn usual(&self) -> Vec<(&'static str, Option<Vec<f64>>)> {
-        let estimates: [(&str, fn(&JointModel) -> f64); 4] = [
+        let estimates: [(&str, Parameter); 4] = [
             ("coulomb_friction", |joint| joint.coulomb_friction),
             ("viscous_friction", |joint| joint.viscous_friction),
             ("armature", |joint| joint.armature),
             ("command_delay", |joint| joint.actuator.command_delay),
         ];
-        let start = |of: fn(&JointModel) -> f64| {
+        let start = |of: Parameter| {
             let pairs = self.drives.estimates.as_ref()?.iter().zip(&self.given);
             Some(pairs.map(|(now, before)| (of(now) - of(before)).max(0.0)).collect())
         };

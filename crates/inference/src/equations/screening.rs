@@ -52,9 +52,12 @@ impl<R: Residuals> Search<'_, R> {
                 if own.is_empty() {
                     continue;
                 }
-                hypotheses.extend(self.hypotheses(law, shape, &own, &candidates, &scores, best, only));
+                hypotheses.extend(self.hypotheses(law, shape, &own, &candidates, &scores, best));
             }
         }
+        let is_within =
+            |cause: &Cause| only.is_none_or(|only| cause.scope.sites.iter().all(|site| only.contains(site)));
+        hypotheses.retain(|(_, cause)| is_within(cause));
         hypotheses.sort_by(|one, other| other.0.total_cmp(&one.0));
         let mut chosen: Vec<(f64, Cause)> = Vec::new();
         for (gain, cause) in hypotheses {
@@ -133,7 +136,6 @@ impl<R: Residuals> Search<'_, R> {
         candidates: &[Candidate],
         scores: &Scores,
         best: &Fitted<R>,
-        only: Option<&[Site]>,
     ) -> Vec<(f64, Cause)> {
         let law = &self.laws[law_index];
         let products = DMatrix::from_fn(own.len(), own.len(), |row, column| {
@@ -147,8 +149,7 @@ impl<R: Residuals> Search<'_, R> {
                     && cause.scope.sites.iter().any(|site| scope.sites.contains(site))
             };
             let removed = |(law, name): &(usize, String)| *law == law_index && *name == scope.label();
-            let is_beyond = only.is_some_and(|only| scope.sites.iter().any(|site| !only.contains(site)));
-            if is_beyond || best.causes.iter().any(known) || self.removed.iter().any(removed) {
+            if best.causes.iter().any(known) || self.removed.iter().any(removed) {
                 continue;
             }
             let members: Vec<usize> =
