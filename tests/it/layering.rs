@@ -197,7 +197,7 @@ const LINES_OF_QUADRUPEDS: [(&str, usize); 23] = [
     ("crates/sim", 63),
     ("crates/envs", 36),
     ("crates/identify", 89),
-    ("crates/diagnose", 59),
+    ("crates/diagnose", 57),
     ("crates/learning", 8),
     ("crates/agent", 9),
     ("crates/viewer", 3),

@@ -9,6 +9,7 @@ mod actuator_network;
 mod effect_table;
 mod error;
 mod tree;
+mod tree_drives;
 mod tree_shapes;
 mod tree_text;
 

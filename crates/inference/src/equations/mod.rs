@@ -3,7 +3,7 @@
 //! - [`explain`]: what explains a log, in the terms of the catalogue.
 //! - [`measurements`]: the channels of a log; [`robot`]: what effects change.
 //! - [`residuals`]: residuals of a log, and the column of any change of the robot; [`site`]: where changes act.
-//! - [`system`]: residuals of a log with torques, without simulation. [`drive`]: the torque of each drive;
+//! - [`torque_residuals`]: residuals of a log with torques, without simulation, from [`system`]. [`drive`]: the torque of each drive;
 //!   [`balance`]: the balance of each joint and of the base in [`samples`] of the log, with its [`columns`]; the gyroscope.
 //! - [`positions`]: residuals of a log without torques on a fixed base, by simulation.
 //! - [`gaussian`]: the evidence of residuals that are linear in unknowns with normal priors; [`block`]: the noise that is left.
@@ -37,6 +37,7 @@ mod site;
 mod system;
 #[cfg(test)]
 mod tests;
+mod torque_residuals;
 mod unknown;
 
 pub use causes::UnknownLaw;
