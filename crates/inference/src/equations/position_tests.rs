@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::atomic::AtomicBool;
 
 use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
-use twinstep_model::{BaseMount, CONTACT, JOINT_NAMES, RobotModel, TreeModel, go2};
+use twinstep_model::{BaseMount, CONTACT, RobotModel, TreeModel, go2};
 
 use super::explain::{Explained, explain};
 use super::robot::Robot;
@@ -17,7 +17,7 @@ fn log(robot: &RobotModel) -> Log {
         for row in 0..1600 {
             let t = 0.005 * row as f64;
             columns.entry("t".to_owned()).or_default().push(t);
-            for (joint, name) in JOINT_NAMES.iter().enumerate() {
+            for (joint, name) in Robot::from(&go2()).tree.joints.iter().map(|joint| &joint.name).enumerate() {
                 let rate = 3.0 + 0.7 * joint as f64 + 0.4 * t;
                 let command = go2().control.default_pose[joint] + 0.3 * (rate * t).sin();
                 columns.entry(format!("q_cmd_{name}")).or_default().push(command);
@@ -33,7 +33,7 @@ fn log(robot: &RobotModel) -> Log {
     let of = Robot::from(robot);
     let tree = TreeModel { tree: of.tree, joints: of.joints, points: Vec::new(), contact: CONTACT };
     let joint_log = JointLog::new(&commands, &tree.tree, |_| true).expect("a fixed base");
-    let zeros = vec![0.0; 12];
+    let zeros = vec![0.0; tree.joints.len()];
     let windows = windows(&joint_log, &tree.tree, WindowLength::WholeRanges);
     let candidate = Candidate { robot: tree, kp: zeros.clone(), kd: zeros };
     let hz = robot.control.actuator_hz;
