@@ -6,6 +6,7 @@ use std::process::{Command as Process, Output};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
+use twinstep_diagnose::Diagnosis;
 use twinstep_effects::{Effect, JointEffect, JointScope, NominalGain, TreeModelFile};
 use twinstep_inference::{Candidate, IdentifyOptions, JointLog, ParameterRequest, evaluate, identify};
 use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
@@ -241,4 +242,67 @@ fn program_identifies_an_arm_and_evaluates_it_on_other_rows() {
     assert!(error.contains("the log has no segment `chirp`; its segments are sines"), "{error}");
     let (_, _, error) = run(&["diagnose", "arm", "--out", "diagnosis"]);
     assert!(error.contains("has no `kp`") && error.contains("identify"), "{error}");
+}
+
+/// Returns a log of 8 s whose gains are known.
+fn log_with_gains() -> Log {
+    let log = log(8.0);
+    let meta = Meta { kp: Some(Gain::Uniform(KP)), kd: Some(Gain::Uniform(KD)), ..log.meta().clone() };
+    Log::new(meta, columns_of(&log)).unwrap()
+}
+
+#[test]
+fn program_names_what_an_arm_has_and_its_file_lacks_from_positions_alone() {
+    let folder = tempfile::tempdir().unwrap();
+    log_with_gains().write(folder.path().join("arm")).unwrap();
+    let robot = root().join("data/robots/so101.xml");
+    let output = twinstep(&["diagnose", "arm", "--model", robot.to_str().unwrap(), "--out", "found"], folder.path());
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let text = std::fs::read_to_string(folder.path().join("found/findings.json")).unwrap();
+    let diagnosis: Diagnosis = serde_json::from_str(&text).unwrap();
+    let names: Vec<&str> = diagnosis.findings.iter().map(|cause| cause.effect.as_str()).collect();
+    for name in ["coulomb_friction", "armature"] {
+        assert!(names.contains(&name), "{text}");
+    }
+    let [before, after] = [diagnosis.baseline, diagnosis.extended].map(|errors| errors.q_rmse_rad.unwrap());
+    assert!(after < 0.2 * before, "{before} -> {after} rad on held-out rows");
+    let model = TreeModelFile::load(folder.path().join("found").join(&diagnosis.extended_model)).unwrap();
+    assert!(!model.effects.is_empty());
+}
+
+#[test]
+fn drives_of_an_unknown_robot_need_torques_and_velocities() {
+    let folder = tempfile::tempdir().unwrap();
+    let positions = log_with_gains();
+    positions.write(folder.path().join("positions")).unwrap();
+    let mut columns = columns_of(&positions);
+    for joint in positions.joints() {
+        columns.insert(format!("tau_measured_{joint}"), vec![0.1; positions.rows()]);
+    }
+    let meta = Meta { tau_sensor: TorqueSensor::MotorCurrent, ..positions.meta().clone() };
+    Log::new(meta, columns).unwrap().write(folder.path().join("torques")).unwrap();
+    for (log, expected) in [("positions", "give the robot's file with --model"), ("torques", "has no `dq`")] {
+        let output = twinstep(&["diagnose", log, "--out", "found"], folder.path());
+        let error = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.code() == Some(2) && error.contains(expected), "{error}");
+    }
+}
+
+#[test]
+fn diagnosis_in_simulations_ends_within_a_second_of_sigterm() {
+    let folder = tempfile::tempdir().unwrap();
+    log_with_gains().write(folder.path().join("arm")).unwrap();
+    let robot = root().join("data/robots/so101.xml");
+    let programs = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap();
+    let mut command = Process::new(programs.twinstep());
+    command.args(["diagnose", "arm", "--out", "found", "--model"]).arg(robot).current_dir(folder.path());
+    let mut child = command.spawn().unwrap();
+    std::thread::sleep(std::time::Duration::from_secs(2));
+    assert!(child.try_wait().unwrap().is_none(), "it was complete before the signal");
+    Process::new("kill").args(["-TERM", &child.id().to_string()]).status().unwrap();
+    let start = std::time::Instant::now();
+    let status = child.wait().unwrap();
+    assert!(start.elapsed().as_secs_f64() < 2.0, "{:.1} s", start.elapsed().as_secs_f64());
+    assert_eq!(status.code(), Some(130));
+    assert!(!folder.path().join("found/findings.json").exists());
 }

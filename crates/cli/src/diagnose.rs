@@ -1,6 +1,8 @@
 //! `twinstep diagnose`: reports which effects a robot model lacks.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use indicatif::{ProgressBar, ProgressStyle};
@@ -104,7 +106,7 @@ pub fn run(args: &Args) -> CommandResult {
     let model = analytic_model(args.model.as_deref())?;
     let robot = model.robot_model().map_err(input)?;
     let mut simulator = simulator(&robot)?;
-    let (output, learned) = with_progress(|progress| {
+    let (output, learned) = with_progress(|progress, _| {
         let output = diagnose(logs.clone(), &model, &mut simulator, progress).map_err(failure)?;
         // What was found must not be lost with the networks.
         let learned = match learned_residual::learn(&logs, &output, progress) {
@@ -185,7 +187,7 @@ fn robot_of_tree(args: &Args, logs: &[Log]) -> Result<Option<TreeModelFile>, Fai
 /// Diagnoses a robot of any tree, writes findings and corrected model, and prints a summary.
 fn run_tree(args: &Args, logs: &[Log], file: TreeModelFile) -> CommandResult {
     let rate = actuator_hz(&file);
-    let found = with_progress(|progress| diagnose_tree(logs, &file, rate, progress).map_err(failure))?;
+    let found = with_progress(|progress, stop| diagnose_tree(logs, &file, rate, &stop, progress).map_err(failure))?;
     let TreeDiagnosis { mut diagnosis, extended } = found;
     // Drives without a robot have no model file.
     if args.model.is_some() || file.robot == TreeModelFile::go2().robot {
@@ -218,15 +220,19 @@ fn motion_pages(
 }
 
 /// Runs `diagnose` with a progress spinner. Ctrl-C interrupts it.
-fn with_progress<T>(diagnose: impl FnOnce(&mut dyn FnMut(&str) -> bool) -> Result<T, Failure>) -> Result<T, Failure> {
+fn with_progress<T>(
+    diagnose: impl FnOnce(&mut dyn FnMut(&str) -> bool, Arc<AtomicBool>) -> Result<T, Failure>,
+) -> Result<T, Failure> {
     let signals = Signals::listen()?;
     let bar = ProgressBar::new_spinner();
     bar.set_style(ProgressStyle::with_template("{spinner} {elapsed} {msg}").expect("a template"));
-    let found = diagnose(&mut |text| {
+    let stop = signals.flag();
+    let mut progress = |text: &str| {
         bar.set_message(text.to_owned());
         bar.tick();
         !signals.check().unwrap_or(true)
-    });
+    };
+    let found = diagnose(&mut progress, stop);
     bar.finish_and_clear();
     found
 }

@@ -3,9 +3,11 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use twinstep_effects::{JointEffect, JointScope, TreeModelFile};
+use twinstep_effects::{JointEffect, JointScope, NominalGain, TreeModelFile};
 use twinstep_inference::equations::{Explanation, explain_tree, torque_error};
-use twinstep_inference::{Candidate, IdentifyOptions, InferenceError, JointLog, ParameterRequest, evaluate, identify};
+use twinstep_inference::{
+    Candidate, IdentifyOptions, InferenceError, JointLog, ParameterRequest, evaluate, identify, joint_indices,
+};
 use twinstep_logs::Log;
 use twinstep_model::TreeModel;
 
@@ -29,11 +31,13 @@ pub struct TreeDiagnosis {
 
 /// Identifies the effects that a robot of any tree lacks, from `logs` of one robot.
 ///
-/// Gains that neither the logs nor the model file state are estimated first, with frictions, inertias and a delay.
+/// Gains that neither the logs nor the model file state are estimated first, with frictions, inertias and a delay. Simulations end soon
+/// after `stop` is true; `progress` must return false then.
 pub fn diagnose_tree(
     logs: &[Log],
     file: &TreeModelFile,
     actuator_hz: f64,
+    stop: &Arc<AtomicBool>,
     progress: &mut DiagnoseProgress,
 ) -> Result<TreeDiagnosis, DiagnoseError> {
     for log in logs {
@@ -42,11 +46,13 @@ pub fn diagnose_tree(
     let joined = Log::joined(logs).ok_or(DiagnoseError::Unlike)?;
     let is_used: Vec<bool> = logs.iter().flat_map(fitted_rows).collect();
     let held_out: Vec<bool> = logs.iter().flat_map(held_out_rows).collect();
-    let (given, estimates) = with_gains(file, &joined, &is_used, actuator_hz, progress)?;
+    let (given, estimates) = with_gains(file, &joined, &is_used, actuator_hz, (stop, progress))?;
     let robot = Candidate::of(&given)?;
+    let joined = with_gains_of(joined, &robot);
     let mut go_on = |text: &str| progress(text);
-    let found = explain_tree(&joined, &robot, estimates.as_ref(), actuator_hz, |row| is_used[row], &mut go_on)?;
-    let found = found.ok_or(DiagnoseError::Interrupted)?;
+    let found = explain_tree(&joined, &robot, estimates.as_ref(), (actuator_hz, stop), |row| is_used[row], &mut go_on)?;
+    // Simulations that were ended have left nothing to report.
+    let found = found.filter(|_| !stop.load(Ordering::Relaxed)).ok_or(DiagnoseError::Interrupted)?;
     let joints: Vec<String> = file.nominal.tree.joints.iter().map(|joint| joint.name.clone()).collect();
     let extended = extended(&given, &found.causes, &joints);
     let errors = |file: &TreeModelFile| errors(&joined, file, &held_out, actuator_hz);
@@ -72,10 +78,17 @@ fn with_gains(
     log: &Log,
     is_used: &[bool],
     actuator_hz: f64,
-    progress: &mut DiagnoseProgress,
+    (stop, progress): (&Arc<AtomicBool>, &mut DiagnoseProgress),
 ) -> Result<(TreeModelFile, Option<TreeModel>), DiagnoseError> {
-    let stated = |joint: &String| log.gains(joint).iter().all(Option::is_some);
-    if log.joints().iter().all(stated) {
+    let of_file =
+        |gains: &Option<NominalGain>, joint: &str| gains.as_ref().is_some_and(|gains| gains.of(joint).is_some());
+    let is_known = |joint: &String| {
+        let pairs = log.gains(joint).map(|gain| gain.is_some()).into_iter().zip([&file.kp, &file.kd]);
+        let names: Vec<&str> = joint_indices(std::slice::from_ref(joint), &file.nominal.tree)
+            .map_or(Vec::new(), |found| vec![&file.nominal.tree.joints[found[0]].name]);
+        pairs.into_iter().all(|(stated, gains)| stated || names.iter().any(|name| of_file(gains, name)))
+    };
+    if log.joints().iter().all(is_known) {
         return Ok((file.clone(), None));
     }
     // The gains of a long log show in a part of it.
@@ -84,7 +97,6 @@ fn with_gains(
     let is_kept = |row: usize| is_used[row] && (row / block).is_multiple_of(step);
     let joint_log = JointLog::new(log, &file.nominal.tree, is_kept)?;
     let requests = ParameterRequest::DEFAULT.map(|request| ParameterRequest(request.to_owned())).to_vec();
-    let stop = Arc::new(AtomicBool::new(false));
     let options = IdentifyOptions { requests, actuator_hz, stop: stop.clone() };
     let mut each = |round: usize, rounds: usize, _| {
         if !progress(&format!("estimating the gains that the log does not state, round {round} of {rounds}")) {
@@ -97,6 +109,14 @@ fn with_gains(
     }
     let estimates = found.model.tree_model().ok();
     Ok((TreeModelFile { kp: found.model.kp, kd: found.model.kd, ..file.clone() }, estimates))
+}
+
+/// Returns the log with the gains of a robot where it states none.
+fn with_gains_of(log: Log, robot: &Candidate) -> Log {
+    log.with_gains(|name| {
+        let joint = joint_indices(&[name.to_owned()], &robot.robot.tree).ok()?[0];
+        Some([robot.kp[joint], robot.kd[joint]])
+    })
 }
 
 /// Returns the model with the causes and their intervals.
@@ -128,7 +148,9 @@ fn extended(file: &TreeModelFile, causes: &[Explanation], joints: &[String]) -> 
 /// Returns the errors of a model in rows: of positions on a fixed base, and of torques if motor currents were measured.
 fn errors(log: &Log, file: &TreeModelFile, rows: &[bool], actuator_hz: f64) -> Result<RmsErrors, DiagnoseError> {
     let candidate = Candidate::of(file)?;
+    let has_bodies = file.nominal.tree.bodies.iter().any(|body| body.inertia.mass > 0.0);
     let q_rmse_rad = match JointLog::new(log, &file.nominal.tree, |row| rows[row]) {
+        Ok(_) if !has_bodies => None,
         Ok(joint_log) => match evaluate(&joint_log, &candidate, actuator_hz) {
             Ok((found, _)) => found.q_rmse_rad,
             Err(InferenceError::Diverges) => None,

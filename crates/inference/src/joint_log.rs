@@ -87,7 +87,7 @@ impl JointLog {
         if selected.is_empty() {
             return Err(InferenceError::NothingToSimulate);
         }
-        Ok(Self { t: log.t().to_vec(), selected, joints, rate_hz: log.meta().rate_hz })
+        Ok(Self { t: log.increasing_t(), selected, joints, rate_hz: log.meta().rate_hz })
     }
 
     /// Returns true if a gain of a joint is unknown.

@@ -163,12 +163,39 @@ impl Log {
         }
     }
 
+    /// Returns the time of each row [s], increasing over the whole log: a segment whose clock begins again follows the one before after 1 s.
+    pub fn increasing_t(&self) -> Vec<f64> {
+        let mut times = self.t.clone();
+        let mut last = f64::NEG_INFINITY;
+        for (_, rows) in self.segments() {
+            let late = if times[rows.start] > last { 0.0 } else { last + 1.0 - times[rows.start] };
+            times[rows.clone()].iter_mut().for_each(|t| *t += late);
+            last = times[rows.end - 1];
+        }
+        times
+    }
+
+    /// Returns the log with gains where it states none: `of` returns the position gain [N·m/rad] and the velocity gain [N·m·s/rad] of a joint.
+    #[must_use]
+    pub fn with_gains(mut self, of: impl Fn(&str) -> Option<[f64; 2]>) -> Self {
+        for joint in self.joints.clone() {
+            let stated = self.gains(&joint);
+            let Some(given) = of(&joint) else { continue };
+            for (index, quantity) in ["kp", "kd"].into_iter().enumerate() {
+                if stated[index].is_none() {
+                    self.channels.insert(format!("{quantity}_{joint}"), vec![given[index]; self.t.len()]);
+                }
+            }
+        }
+        self
+    }
+
     /// Joins logs of one robot: their segments follow each other, 10 s apart. Channels that one of them lacks are left out.
     ///
     /// Returns `None` if they have other joints, torque sensors, rates or orientations of a fixed base, or one of them no gains.
     pub fn joined(logs: &[Self]) -> Option<Self> {
         let (first, others) = logs.split_first()?;
-        let mut joined = first.clone();
+        let mut joined = Self { t: first.increasing_t(), ..first.clone() };
         if others.is_empty() {
             return Some(joined);
         }
@@ -190,9 +217,10 @@ impl Log {
         }
         (joined.meta.kp, joined.meta.kd) = (None, None);
         for log in others {
-            let start = joined.t.last().map_or(0.0, |last| last + 10.0) - log.t.first().copied().unwrap_or(0.0);
+            let times = log.increasing_t();
+            let start = joined.t.last().map_or(0.0, |last| last + 10.0) - times.first().copied().unwrap_or(0.0);
             let segments = joined.meta.segments.len() as u32;
-            joined.t.extend(log.t.iter().map(|t| start + t));
+            joined.t.extend(times.iter().map(|t| start + t));
             joined.segment.extend(log.segment.iter().map(|segment| segments + segment));
             joined.episode.extend(&log.episode);
             joined.meta.segments.extend(log.meta.segments.iter().cloned());
@@ -311,6 +339,28 @@ mod tests {
         assert!(joined.t().windows(2).all(|pair| pair[0] < pair[1]));
         assert_eq!(joined.q_cmd("elbow"), Some([20.0, 20.0, 30.0, 30.0].as_slice()));
         assert_eq!(joined.dq("elbow"), None);
+    }
+
+    #[test]
+    fn clock_that_begins_again_in_a_segment_goes_on() {
+        let segment = |name: &str| Segment { name: name.to_owned(), base: BaseMount::Fixed };
+        let meta = Meta::new(200.0, TorqueSensor::None, vec![segment("one"), segment("two")]);
+        let columns = BTreeMap::from([
+            ("t".to_owned(), vec![0.0, 0.005, 0.0, 0.005]),
+            ("segment".to_owned(), vec![0.0, 0.0, 1.0, 1.0]),
+            ("q_elbow".to_owned(), vec![0.1; 4]),
+            ("q_cmd_elbow".to_owned(), vec![0.1; 4]),
+        ]);
+        let log = Log::new(meta, columns).expect("a log");
+        assert_eq!(log.increasing_t(), [0.0, 0.005, 1.005, 1.01]);
+    }
+
+    #[test]
+    fn gains_that_a_log_states_are_kept_and_others_are_added() {
+        let mut log = log(20.0, false);
+        log.meta.kd = None;
+        let gains = log.with_gains(|_| Some([50.0, 3.0])).gains("elbow");
+        assert_eq!(gains, [Some(vec![20.0, 20.0]), Some(vec![3.0, 3.0])]);
     }
 
     #[test]

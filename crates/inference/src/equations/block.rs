@@ -5,7 +5,7 @@
 pub struct Block {
     /// Name, such as `torque FL_calf hang`.
     pub name: String,
-    /// Time of each row [s], increasing within a part of the log.
+    /// Time of each row [s], increasing.
     pub t: Vec<f64>,
     /// Measured minus modelled.
     pub y: Vec<f64>,
@@ -88,8 +88,6 @@ impl Whitener {
         let mut rows = Vec::with_capacity(block.t.len());
         for row in 0..block.t.len() {
             let gap = if row == 0 { f64::INFINITY } else { block.t[row] - block.t[row - 1] };
-            // The clock of a log may begin again in a segment.
-            let gap = if gap < 0.0 { f64::INFINITY } else { gap };
             let decay = (-gap / shape.time).exp();
             let predicted = decay * decay * variance + shape.ratio * (1.0 - decay * decay);
             let innovation = predicted + 1.0;

@@ -1,6 +1,8 @@
 //! The causes of a log, in the terms of the catalogue.
 
 use std::ops::Range;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 use twinstep_effects::{Effect, Scope};
 use twinstep_logs::Log;
@@ -89,23 +91,30 @@ pub fn explain(
     go_on: &mut dyn FnMut(&str) -> bool,
 ) -> Result<Option<Explained>, InferenceError> {
     let zeros = vec![0.0; robot.joints.len()];
-    let drives = Drives { kp: zeros.clone(), kd: zeros, actuator_hz: robot.control.actuator_hz, estimates: None };
+    let drives = Drives {
+        kp: zeros.clone(),
+        kd: zeros,
+        actuator_hz: robot.control.actuator_hz,
+        estimates: None,
+        stop: Arc::default(),
+    };
     explain_robot(log, Robot::from(robot), &drives, scopes(), is_used, go_on)
 }
 
 /// Finds what a robot of any tree lacks, as [`explain`] does. Of its bodies nothing is a cause: model files of trees have effects at joints.
 ///
-/// `estimates` is a robot with first estimates of friction, inertia and delay, from which a search in simulations begins.
+/// Simulations end soon after `stop` is true; `go_on` must return false then. `estimates` is a robot with first estimates of friction, inertia and delay, from which a search in simulations begins.
 pub fn explain_tree(
     log: &Log,
     robot: &Candidate,
     estimates: Option<&TreeModel>,
-    actuator_hz: f64,
+    (actuator_hz, stop): (f64, &Arc<AtomicBool>),
     is_used: impl Fn(usize) -> bool,
     go_on: &mut dyn FnMut(&str) -> bool,
 ) -> Result<Option<Explained>, InferenceError> {
     let (kp, kd) = (robot.kp.clone(), robot.kd.clone());
-    let drives = Drives { kp, kd, actuator_hz, estimates: estimates.map(|robot| robot.joints.clone()) };
+    let drives =
+        Drives { kp, kd, actuator_hz, estimates: estimates.map(|robot| robot.joints.clone()), stop: stop.clone() };
     explain_robot(log, Robot::from(&robot.robot), &drives, scopes_of(&robot.robot.tree), is_used, go_on)
 }
 
@@ -137,6 +146,9 @@ fn explain_robot(
         }
         Search::new(&system, &laws, scopes, robot.clone()).run(go_on)
     } else {
+        if !robot.has_bodies() {
+            return Err(missing(log));
+        }
         for law in &mut laws {
             law.is_cause &= is_simulated(law);
             few_variants(law);
@@ -145,6 +157,17 @@ fn explain_robot(
         Search::new(&positions, &laws, scopes, robot.clone()).run(go_on)
     };
     Ok(found.map(|found| Explained { is_of_positions, ..explained(found, &laws, &robot) }))
+}
+
+/// Returns what the equations of drives alone lack in a log.
+fn missing(log: &Log) -> InferenceError {
+    let lacks = |joint: &String| match (log.dq(joint), log.tau_measured(joint)) {
+        (None, _) => Some((joint.clone(), "dq")),
+        (_, None) => Some((joint.clone(), "tau_measured")),
+        _ => None,
+    };
+    let found = log.joints().iter().find_map(lacks);
+    found.map_or(InferenceError::NothingToSimulate, |(joint, quantity)| InferenceError::Missing { joint, quantity })
 }
 
 /// Returns the root mean square error of the torques of a robot's drives, on measured states, in the rows that are used [N·m].

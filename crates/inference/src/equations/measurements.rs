@@ -112,7 +112,7 @@ impl Measurements {
         if joints.len() != robot.joints.len() {
             return None;
         }
-        let t = log.t().to_vec();
+        let t = log.increasing_t();
         let ranges: Vec<Range<usize>> = log.segments().flat_map(|(_, range)| split_at_gaps(&t, range)).collect();
         for rows in &mut joints {
             rows.smooth = [smoothed(&rows.q, &ranges), smoothed(&rows.dq, &ranges)];

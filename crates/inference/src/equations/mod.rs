@@ -5,7 +5,7 @@
 //! - [`residuals`]: residuals of a log, and the column of any change of the robot; [`site`]: where changes act.
 //! - [`torque_residuals`]: residuals of a log with torques, without simulation, from [`system`]. [`drive`]: the torque of each drive;
 //!   [`balance`]: the balance of each joint and of the base in [`samples`] of the log, with its [`columns`]; the gyroscope.
-//! - [`positions`]: residuals of a log without torques on a fixed base, by simulation.
+//! - [`positions`]: residuals of a log without torques on a fixed base, by simulation; [`small_changes`]: what every robot has a little of.
 //! - [`gaussian`]: the evidence of residuals that are linear in unknowns with normal priors; [`block`]: the noise that is left.
 //! - [`law`]: an effect with its unknowns. [`nuisance`]: what every robot has a little of.
 //! - [`search`]: the set of causes of highest evidence, by [`screening`] of all effects and a [`fit`] of the best; [`imitations`]: causes that only imitate
@@ -34,6 +34,7 @@ mod samples;
 mod screening;
 mod search;
 mod site;
+mod small_changes;
 mod system;
 #[cfg(test)]
 mod tests;

@@ -3,16 +3,18 @@
 //! Nothing measured is differentiated. The robot is simulated in windows from their first measured states, and columns are differences of
 //! simulations. On a fixed base the limbs move independently, so one simulation has a change at each of them.
 
-use glam::{DAffine3, DVec3};
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
 use twinstep_logs::Log;
 use twinstep_model::{CONTACT, JointModel, RobotTree, TreeModel};
 
 use super::block::{Block, Column};
 use super::gaussian::Group;
 use super::law::{Law, Place};
-use super::nuisance;
 use super::residuals::{Change, Residuals, Small, State};
 use super::robot::Robot;
+use super::small_changes::{SmallChange, SmallUnknown, small_unknowns};
 use crate::{Candidate, InferenceError, JointLog, Trace, Window, WindowLength, simulate, windows};
 
 /// Least time between compared rows [s].
@@ -25,30 +27,6 @@ const POSITION: f64 = 1e-3;
 const DIVERGED: f64 = 10.0;
 /// Change of a position that only an unstable simulation has [rad].
 const UNSTABLE: f64 = 3.0;
-
-/// An unknown that is never reported.
-#[derive(Clone, Copy, Debug)]
-struct SmallUnknown {
-    change: SmallChange,
-    /// Standard deviation.
-    std: f64,
-}
-
-#[derive(Clone, Copy, Debug)]
-enum SmallChange {
-    /// Unknown of a law at a joint.
-    OfLaw { law: usize, joint: usize, unknown: usize },
-    /// Constant torque at a joint [N·m].
-    Torque { joint: usize },
-    /// Mass of a body, relative to its own.
-    Mass { body: usize },
-    /// Centre of mass of a body along an axis [m].
-    Centre { body: usize, axis: usize },
-    /// Inertia of a body about an axis, relative to the trace.
-    Inertia { body: usize, axis: usize },
-    /// Tilt of the base about an axis [rad].
-    Tilt { axis: usize },
-}
 
 /// Measured minus simulated positions of the joints of a log.
 pub struct Positions {
@@ -76,6 +54,8 @@ pub struct Drives {
     pub actuator_hz: f64,
     /// First estimates of the joints.
     pub estimates: Option<Vec<JointModel>>,
+    /// Ends simulations when it is true: what they would have is then missing.
+    pub stop: Arc<AtomicBool>,
 }
 
 /// Returns a parameter of a joint.
@@ -133,13 +113,7 @@ impl Positions {
         };
         let candidates: Vec<Candidate> = robots.iter().map(candidate).collect();
         let run = |candidates: &[Candidate]| {
-            simulate(
-                &self.log,
-                &self.windows,
-                candidates,
-                self.drives.actuator_hz,
-                &std::sync::atomic::AtomicBool::new(false),
-            )
+            simulate(&self.log, &self.windows, candidates, self.drives.actuator_hz, &self.drives.stop)
         };
         if let Ok(all) = run(&candidates) {
             return all.into_iter().map(|traces| Simulated(Some(traces))).collect();
@@ -317,88 +291,6 @@ impl Residuals for Positions {
         let dq = (q[to] - q[from]) / (self.log.t[rows.start + to] - self.log.t[rows.start + from]).max(1e-6);
         State { q: q[inner], dq, torque: if torque[inner].is_finite() { torque[inner] } else { 0.0 } }
     }
-}
-
-impl SmallChange {
-    /// Changes a robot by a value.
-    fn apply(self, laws: &[Law], robot: &mut Robot, value: f64) {
-        if value == 0.0 {
-            return;
-        }
-        match self {
-            Self::OfLaw { law, joint, unknown } => {
-                let mut unknowns = vec![0.0; laws[law].units.len()];
-                unknowns[unknown] = value;
-                nuisance::add(robot, &laws[law], joint, &unknowns, laws[law].shapes[0]);
-            }
-            Self::Torque { joint } => robot.joints[joint].spring.torque_offset += value,
-            Self::Mass { body } => robot.tree.bodies[body].inertia.mass *= (1.0 + value).max(0.1),
-            Self::Centre { body, axis } => robot.tree.bodies[body].inertia.com[axis] += value,
-            Self::Inertia { body, axis } => {
-                let inertia = &mut robot.tree.bodies[body].inertia.inertia;
-                let trace = inertia.x_axis.x + inertia.y_axis.y + inertia.z_axis.z;
-                inertia.col_mut(axis)[axis] = (inertia.col(axis)[axis] + value * trace).max(1e-9);
-            }
-            Self::Tilt { axis } => {
-                let turn = DAffine3::from_axis_angle([DVec3::X, DVec3::Y, DVec3::Z][axis], value);
-                for joint in robot.tree.joints.iter_mut().filter(|joint| joint.parent == 0) {
-                    joint.parent_from_child = turn * joint.parent_from_child;
-                }
-            }
-        }
-    }
-
-    /// Returns the least value that is possible on top of what a robot has.
-    fn least(self, laws: &[Law], robot: &Robot) -> f64 {
-        let Self::OfLaw { law, joint, .. } = self else { return f64::NEG_INFINITY };
-        let (joint, scale) = (&robot.joints[joint], robot.scale[joint]);
-        match laws[law].effect.name {
-            "coulomb_friction" => -joint.coulomb_friction / scale,
-            "viscous_friction" => -joint.viscous_friction / scale,
-            "load_friction" => -joint.load_friction,
-            "armature" => -joint.armature / scale,
-            "command_delay" | "torque_delay" | "drive_lag" | "torque_dead_zone" => 0.0,
-            _ => f64::NEG_INFINITY,
-        }
-    }
-}
-
-/// Laws that every joint has a little of, as far as positions show them, with the standard deviations of [`nuisance`].
-const SMALL_LAWS: [&str; 8] = [
-    "command_delay",
-    "pd_gain",
-    "drive_lag",
-    "coulomb_friction",
-    "viscous_friction",
-    "load_friction",
-    "armature",
-    "encoder_offset",
-];
-
-fn small_unknowns(robot: &Robot, laws: &[Law], log: &JointLog) -> Vec<SmallUnknown> {
-    let mut small = Vec::new();
-    for channels in &log.joints {
-        for name in SMALL_LAWS {
-            let law = laws.iter().enumerate().filter(|(_, law)| law.effect.name == name);
-            let Some((law, found)) = law.max_by_key(|(_, law)| law.units.len()) else { continue };
-            small.extend((0..found.units.len()).map(|unknown| SmallUnknown {
-                change: SmallChange::OfLaw { law, joint: channels.joint, unknown },
-                std: nuisance::small_std(name, unknown),
-            }));
-        }
-        let joint = channels.joint;
-        small.push(SmallUnknown { change: SmallChange::Torque { joint }, std: nuisance::STICK * robot.scale[joint] });
-    }
-    let [mass, inertia, centre] = nuisance::BODY;
-    for body in 1..robot.tree.bodies.len() {
-        small.push(SmallUnknown { change: SmallChange::Mass { body }, std: mass });
-        for axis in 0..3 {
-            small.push(SmallUnknown { change: SmallChange::Centre { body, axis }, std: centre });
-            small.push(SmallUnknown { change: SmallChange::Inertia { body, axis }, std: inertia });
-        }
-    }
-    small.extend([0, 1].map(|axis| SmallUnknown { change: SmallChange::Tilt { axis }, std: nuisance::TILT }));
-    small
 }
 
 /// Returns the limb of each joint: a part of the tree that only the base joins to others.

@@ -28,6 +28,13 @@ pub struct Robot {
     pub contact_time: f64,
 }
 
+impl Robot {
+    /// Returns true if the bodies are known, not the drives alone.
+    pub fn has_bodies(&self) -> bool {
+        self.tree.bodies.iter().any(|body| body.inertia.mass > 0.0)
+    }
+}
+
 impl From<&RobotModel> for Robot {
     fn from(robot: &RobotModel) -> Self {
         let mut tree = RobotTree::from(robot);

@@ -115,7 +115,7 @@ impl Sample {
 /// Collects the samples of a log; none if the bodies of the robot are not known.
 pub fn samples(measured: &Measurements, robot: &Robot) -> Vec<Sample> {
     let mut samples = Vec::new();
-    if robot.tree.bodies.iter().all(|body| body.inertia.mass == 0.0) {
+    if !robot.has_bodies() {
         return samples;
     }
     let structure = TreeStructure::new(&robot.tree);
