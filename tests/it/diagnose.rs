@@ -33,7 +33,8 @@ fn diagnosis_of(recording: &Log, folder: &Path) -> Diagnosis {
     assert!(page.starts_with("<!doctype html>") && page.len() > 10_000);
     let extended = ModelFile::load(out.join(&diagnosis.extended_model)).unwrap();
     let of_causes: usize = diagnosis.findings.iter().map(|cause| entries_of(cause, &extended)).sum();
-    assert_eq!(extended.effects.len(), of_causes + diagnosis.joint_gains.len());
+    // Beside the causes the model has the little that each joint has of other effects.
+    assert!(extended.effects.len() >= of_causes + diagnosis.joint_gains.len());
     diagnosis
 }
 
@@ -93,13 +94,15 @@ fn check_half_of_a_real_recording(fitted: usize) {
     let diagnosis: Diagnosis = serde_json::from_slice(&output.stdout).unwrap();
     let names: Vec<String> =
         diagnosis.findings.iter().map(|cause| format!("{}@{}", cause.effect, cause.scope)).collect();
-    for name in ["viscous_friction@hip", "coulomb_friction@thigh", "coulomb_friction@calf"] {
-        assert!(names.iter().any(|found| found == name), "{names:?}");
+    // Each joint has its own friction and inertia. In the slow half, dry friction that falls with the speed fits as well as constant one.
+    for laws in [["coulomb_friction@all", "stribeck_friction@all"], ["viscous_friction@all", "viscous_friction@all"]] {
+        assert!(names.iter().any(|found| laws.contains(&found.as_str())), "{names:?}");
     }
+    assert!(names.iter().any(|found| found == "armature@all"), "{names:?}");
     let robot = ModelFile::load(out.join(&diagnosis.extended_model)).unwrap().robot_model().unwrap();
     let mut simulator = BatchRollout::new(&go2(), &SimConfig::default()).unwrap();
     let error = evaluate(&halves[1 - fitted], &robot, &mut simulator, |_| true).unwrap().q_rmse_rad.unwrap();
-    assert!(error < 0.0105, "{error} rad, {names:?}");
+    assert!(error < 0.0085, "{error} rad, {names:?}");
 }
 
 #[test]

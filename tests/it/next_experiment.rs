@@ -98,7 +98,7 @@ fn chosen_trajectory_discriminates_better_than_the_median_one() {
     assert!(chosen > ratios[ratios.len() / 2][1] + 10.0, "chosen {chosen:.1}: {ratios:.1?}");
 }
 
-/// Returns commands of one slow sine per joint for 6 s, at which a delay and viscous friction have the same effect.
+/// Returns commands of one slow sine per joint for 6 s, at which all laws of dry friction have the same effect.
 fn slow_sines() -> Log {
     let segments = vec![Segment { name: "sines".to_owned(), base: BaseMount::Fixed }];
     let meta = Meta {
@@ -119,8 +119,8 @@ fn slow_sines() -> Log {
 fn diagnosis_with_an_alternative_writes_commands_that_play_accepts() {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
-    let (viscous, thighs) = effect("viscous_friction", "thigh");
-    let entry = EffectEntry::new(viscous, thighs, vec![0.15]).unwrap();
+    let (friction, thighs) = effect("coulomb_friction", "thigh");
+    let entry = EffectEntry::new(friction, thighs, vec![0.2]).unwrap();
     let robot = ModelFile { effects: vec![entry], ..ModelFile::default() };
     std::fs::write(path("robot.toml"), robot.to_toml()).unwrap();
     let run = |arguments: &[&str]| {
@@ -132,8 +132,8 @@ fn diagnosis_with_an_alternative_writes_commands_that_play_accepts() {
     log.write(path("first.parquet")).unwrap();
     let printed = run(&["diagnose", &path("first.parquet"), "--out", &path("one"), "--json"]);
     let diagnosis: Diagnosis = serde_json::from_slice(&printed).unwrap();
-    let next = diagnosis.next_experiment.expect("a delay has the same effect");
-    assert!(next.parts[0].effects.iter().any(|name| name.starts_with("command_delay@")), "{next:?}");
+    let next = diagnosis.next_experiment.expect("friction that falls at higher speeds has the same effect");
+    assert!(next.parts[0].effects.iter().any(|name| name.starts_with("stribeck_friction@")), "{next:?}");
     assert!(next.parts[0].predicted_nats > next.parts[0].median_nats, "{next:?}");
     let page = std::fs::read_to_string(path("one/report.html")).unwrap();
     assert!(page.contains("Next experiment: <code>next_experiment</code>"));

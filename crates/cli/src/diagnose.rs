@@ -7,9 +7,9 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use indicatif::{ProgressBar, ProgressStyle};
 use twinstep_diagnose::{
-    DiagnoseError, Diagnosis, DiagnosisOutput, ParameterValue, RmsErrors, TreeDiagnosis, diagnose, diagnose_tree,
+    Cause, DiagnoseError, Diagnosis, DiagnosisOutput, ParameterValue, RmsErrors, TreeDiagnosis, diagnose, diagnose_tree,
 };
-use twinstep_effects::TreeModelFile;
+use twinstep_effects::{Effect, Scope, TreeModelFile};
 use twinstep_logs::replay::check_gains;
 use twinstep_logs::{Log, TorqueSensor};
 use twinstep_model::Joint;
@@ -106,8 +106,8 @@ pub fn run(args: &Args) -> CommandResult {
     let model = analytic_model(args.model.as_deref())?;
     let robot = model.robot_model().map_err(input)?;
     let mut simulator = simulator(&robot)?;
-    let (output, learned) = with_progress(|progress, _| {
-        let output = diagnose(logs.clone(), &model, &mut simulator, progress).map_err(failure)?;
+    let (output, learned) = with_progress(|progress, stop| {
+        let output = diagnose(logs.clone(), &model, &mut simulator, &stop, progress).map_err(failure)?;
         // What was found must not be lost with the networks.
         let learned = match learned_residual::learn(&logs, &output, progress) {
             Err(Failure::Input(error) | Failure::Other(error)) => {
@@ -151,7 +151,9 @@ pub fn run(args: &Args) -> CommandResult {
         logs: args.logs.iter().zip(&logs).map(|(path, log)| LogFacts::of(&path.display().to_string(), log)).collect(),
         motions: motions.clone(),
     };
-    let data = ReportData::gather(&logs[0], &model, &laws, &mut simulator, provenance).map_err(other)?;
+    let name = |cause: &Cause| Effect::named(&cause.effect).zip(cause.scope.parse().ok());
+    let causes: Vec<(&Effect, Scope)> = diagnosis.findings.iter().filter_map(name).collect();
+    let data = ReportData::gather(&logs[0], &model, &laws, &causes, &mut simulator, provenance).map_err(other)?;
     let report = args.out.join("report.html");
     write_report(&diagnosis, &data, &report).map_err(input)?;
     print_findings(&diagnosis, args)?;

@@ -1,9 +1,12 @@
-//! Diagnosis of logs of a Go2 with motor currents: the causes are those of highest evidence in the equations of the logs.
+//! Diagnosis of logs of a Go2 with motor currents, or on a fixed base: the causes are those of highest evidence in the residuals of torques
+//! or positions.
 //!
 //! [`twinstep_inference::equations`] finds them in the rows that are not held out. Simulations estimate the gains of
 //! the joints where the equations show that they differ, measure the errors in the held-out rows, and choose the next experiment.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use twinstep_effects::{Composition, Effect, EffectEntry, EntryError, ModelFile, Scope};
 use twinstep_identify::window::WindowConfig;
@@ -20,18 +23,22 @@ use super::joint_gains::JointGains;
 use super::residual_data::ResidualData;
 use super::{DiagnoseError, DiagnosisOutput, errors, experiment_design, held_out_rows, reporting, unexplained};
 
-/// Diagnoses the logs of one robot. Returns `None` if the equations do not apply to them: they have no motor currents, or the robot does
-/// not hang, and stand where its base moves.
+/// Diagnoses the logs of one robot. Returns `None` if they have neither motor currents nor a fixed base, or if the robot does not hang, and
+/// stand where its base moves.
 pub fn diagnose_by_equations(
     logs: &[Log],
     model: &ModelFile,
     simulator: &mut dyn Rollout,
+    stop: &Arc<AtomicBool>,
     say: &mut dyn FnMut(&str) -> Result<(), DiagnoseError>,
 ) -> Result<Option<DiagnosisOutput>, DiagnoseError> {
     let robot = model.robot_model()?;
     let Some(joined) = Log::joined(logs) else { return Ok(None) };
-    if joined.meta().tau_sensor != TorqueSensor::MotorCurrent {
-        return Ok(None);
+    let is_fixed = joined.segments().all(|(segment, _)| segment.base.is_fixed());
+    match joined.meta().tau_sensor {
+        TorqueSensor::MotorCurrent => {}
+        TorqueSensor::None if is_fixed => {}
+        _ => return Ok(None),
     }
     let held_out: Vec<Vec<bool>> = logs.iter().map(held_out_rows).collect();
     let is_used: Vec<bool> = logs.iter().flat_map(fitted_rows).collect();
@@ -40,12 +47,14 @@ pub fn diagnose_by_equations(
         interrupted = say(text);
         interrupted.is_ok()
     };
-    let found = explain(&joined, &robot, |row| is_used[row], &mut go_on);
+    let found = explain(&joined, &robot, stop, |row| is_used[row], &mut go_on);
     interrupted?;
-    let Ok(Some(found)) = found else { return Ok(None) };
+    let Ok(found) = found else { return Ok(None) };
+    // Simulations that were ended have left nothing to report.
+    let found = found.filter(|_| !stop.load(Ordering::Relaxed)).ok_or(DiagnoseError::Interrupted)?;
     say("simulating the log")?;
     let evidence = ResidualData::new(logs.to_vec(), &robot, WindowConfig::DIAGNOSIS)?;
-    let with_causes = extended(model, &found.causes)?;
+    let with_causes = extended(model, found.all())?;
     let gains = found.gains_differ.then(|| JointGains::fit(&evidence, &with_causes, LEAST_GAIN, simulator)).flatten();
     let extended = gains.as_ref().map_or(with_causes.clone(), |gains| gains.added_to(&with_causes));
     if evidence.residual_power(simulator, &robot).diverged() {
@@ -83,8 +92,8 @@ pub fn diagnose_by_equations(
     }))
 }
 
-/// Returns the model with the causes and their intervals.
-fn extended(model: &ModelFile, causes: &[Explanation]) -> Result<ModelFile, DiagnoseError> {
+/// Returns the model with effects and their intervals.
+fn extended<'a>(model: &ModelFile, causes: impl Iterator<Item = &'a Explanation>) -> Result<ModelFile, DiagnoseError> {
     let mut extended = model.clone();
     for cause in causes {
         let each = cause.by_joint.iter().map(|own| (Scope::Joint(Joint::ALL[own.joint]), &own.values, &own.intervals));

@@ -85,9 +85,7 @@ pub fn pairs(extended: &ModelFile, accepted: &Accepted, confusable: &[Correlated
 /// Returns a pair of two hypotheses on top of all other causes.
 fn hypothesis_pair(extended: &ModelFile, one: &Hypothesis, other: &Hypothesis) -> HypothesisPair {
     let is = |entry: &EffectEntry, hypothesis: &Hypothesis| {
-        entry.effect.name == hypothesis.effect.name
-            && entry.scope == hypothesis.scope
-            && entry.values == hypothesis.values
+        entry.effect.name == hypothesis.effect.name && entry.scope.is_within(hypothesis.scope)
     };
     let mut model = extended.clone();
     model.effects.retain(|entry| !is(entry, one) && !is(entry, other));

@@ -1,6 +1,6 @@
 //! Diagnosis: identifies the effects of the catalogue that a model lacks, by comparison with logs.
 //!
-//! - [`by_equations`]: logs of a Go2 with motor currents; [`of_tree`]: logs of a robot of any tree; [`explained`]: their findings.
+//! - [`by_equations`]: logs of a Go2 with motor currents, or on a fixed base; [`of_tree`]: logs of a robot of any tree; [`explained`]: their findings.
 //!
 //! Other logs of a Go2 are searched in simulations:
 //!
@@ -72,6 +72,8 @@ mod unexplained;
 mod unreported_effects;
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 use twinstep_effects::ModelFile;
 use twinstep_effects::{Effect, Scope};
@@ -155,10 +157,13 @@ pub struct DiagnosisOutput {
 }
 
 /// Identifies the effects that `model` lacks, from `logs` of one robot.
+///
+/// Simulations end soon after `stop` is true; `progress` must return false then.
 pub fn diagnose(
     logs: Vec<Log>,
     model: &ModelFile,
     simulator: &mut dyn Rollout,
+    stop: &Arc<AtomicBool>,
     progress: &mut DiagnoseProgress,
 ) -> Result<DiagnosisOutput, DiagnoseError> {
     let mut say = |text: &str| if progress(text) { Ok(()) } else { Err(DiagnoseError::Interrupted) };
@@ -166,7 +171,7 @@ pub fn diagnose(
         check_gains(log).map_err(ExperimentError::from)?;
         log.check_measurements_per_period()?;
     }
-    if let Some(output) = by_equations::diagnose_by_equations(&logs, model, simulator, &mut say)? {
+    if let Some(output) = by_equations::diagnose_by_equations(&logs, model, simulator, stop, &mut say)? {
         return Ok(output);
     }
     say("fitting the ground and the nuisance parameters")?;

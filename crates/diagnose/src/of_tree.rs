@@ -54,7 +54,7 @@ pub fn diagnose_tree(
     // Simulations that were ended have left nothing to report.
     let found = found.filter(|_| !stop.load(Ordering::Relaxed)).ok_or(DiagnoseError::Interrupted)?;
     let joints: Vec<String> = file.nominal.tree.joints.iter().map(|joint| joint.name.clone()).collect();
-    let extended = extended(&given, &found.causes, &joints);
+    let extended = extended(&given, found.all(), &joints);
     let errors = |file: &TreeModelFile| errors(&joined, file, &held_out, actuator_hz);
     let diagnosis = Diagnosis {
         baseline: errors(&given)?,
@@ -119,8 +119,12 @@ fn with_gains_of(log: Log, robot: &Candidate) -> Log {
     })
 }
 
-/// Returns the model with the causes and their intervals.
-fn extended(file: &TreeModelFile, causes: &[Explanation], joints: &[String]) -> TreeModelFile {
+/// Returns the model with effects and their intervals.
+fn extended<'a>(
+    file: &TreeModelFile,
+    causes: impl Iterator<Item = &'a Explanation>,
+    joints: &[String],
+) -> TreeModelFile {
     let mut extended = file.clone();
     for cause in causes {
         let entry = |scope: JointScope, values: &[f64], intervals: &[[f64; 2]]| JointEffect {

@@ -1,6 +1,6 @@
 //! Entries of a model file, and their application to a robot.
 
-use super::{Composition, Effect, EffectSite, Scope, Target};
+use super::{Composition, Effect, EffectSite, LEAST_SUM, Scope, Target};
 use twinstep_model::{ActuatorParams, Joint, RobotModel};
 
 /// Effect with its scope and values.
@@ -151,8 +151,9 @@ fn check_robot(robot: &RobotModel) -> Option<&'static str> {
         if [command_delay, torque_delay, sensor_delay].iter().any(|delay| *delay > ActuatorParams::MAX_DELAY + 1e-9) {
             return Some("the delays of a joint add up to more than 0.04 s");
         }
-        if joint.armature < 0.0 {
-            return Some("the armature of a joint adds up to less than zero");
+        let sums = [joint.armature, joint.viscous_friction, joint.coulomb_friction];
+        if sums.iter().any(|sum| *sum < LEAST_SUM) {
+            return Some("the armature or the friction of a joint adds up to less than zero");
         }
         if joint.armature <= 0.0 && (joint.actuator.backlash > 0.0 || joint.actuator.gear_stiffness.is_finite()) {
             return Some("a joint with backlash or gear elasticity needs an armature above zero");

@@ -42,6 +42,9 @@ pub use shipped_robots::shipped_robots;
 
 use twinstep_model::{JointModel, RobotModel};
 
+/// Least sum of what cannot be negative: a sum of entries is rounded.
+const LEAST_SUM: f64 = -1e-9;
+
 /// Effect of the catalogue.
 #[derive(Debug)]
 pub struct Effect {
@@ -180,6 +183,16 @@ impl Effect {
             }
             Probes::Values(values) => values(),
             Probes::None => Vec::new(),
+        }
+    }
+
+    /// Returns what a joint has of an effect whose values add up to a sum that cannot be negative: an entry can take away that much.
+    pub fn amount(&self, joint: &JointModel) -> f64 {
+        match self.name {
+            "coulomb_friction" => joint.coulomb_friction,
+            "viscous_friction" => joint.viscous_friction,
+            "armature" => joint.armature,
+            _ => 0.0,
         }
     }
 

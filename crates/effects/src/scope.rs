@@ -56,6 +56,13 @@ impl Scope {
         }
     }
 
+    /// Returns true if all that the scope contains is in another one.
+    pub fn is_within(self, other: Self) -> bool {
+        self == other
+            || self.joints() > 0
+                && Joint::ALL.into_iter().filter(|joint| self.contains(*joint)).all(|joint| other.contains(joint))
+    }
+
     /// Returns the number of joints in the scope.
     pub fn joints(self) -> usize {
         Joint::ALL.into_iter().filter(|joint| self.contains(*joint)).count()

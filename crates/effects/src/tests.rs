@@ -3,7 +3,7 @@
 use proptest::prelude::*;
 
 use super::*;
-use twinstep_model::go2;
+use twinstep_model::{Joint, go2};
 
 fn named(name: &str) -> &'static Effect {
     Effect::named(name).expect("in the catalogue")
@@ -210,4 +210,17 @@ proptest! {
         let scope = scopes[index % scopes.len()];
         prop_assert_eq!(scope.to_string().parse::<Scope>(), Ok(scope));
     }
+}
+
+#[test]
+fn friction_can_be_less_than_the_file_states_and_never_less_than_none() {
+    let mut robot = go2();
+    robot.joints[2].viscous_friction = 0.3;
+    let entry = |value| {
+        EffectEntry::new(Effect::named("viscous_friction").unwrap(), Scope::Joint(Joint::ALL[2]), vec![value]).unwrap()
+    };
+    let less = apply_effects(&robot, &[entry(-0.2)]).unwrap();
+    assert!((less.joints[2].viscous_friction - 0.1).abs() < 1e-12);
+    let error = apply_effects(&robot, &[entry(-0.4)]).unwrap_err();
+    assert!(error.to_string().contains("less than zero"), "{error}");
 }

@@ -12,7 +12,7 @@ fn main() {
             eprintln!("{:.1} s: {line}", start.elapsed().as_secs_f64());
             true
         };
-        let found = match explain(&log, &go2(), |_| true, &mut say) {
+        let found = match explain(&log, &go2(), &std::sync::Arc::default(), |_| true, &mut say) {
             Ok(found) => found.expect("it is not interrupted"),
             Err(error) => {
                 println!("{path}: {error}");

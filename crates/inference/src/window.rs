@@ -53,8 +53,6 @@ pub fn windows(log: &JointLog, robot: &RobotTree, length: WindowLength) -> Vec<W
         for part in 0..parts {
             let at = |part: usize| selected.start + (selected.len() - 1) * part / parts;
             let rows = at(part)..at(part + 1) + 1;
-            // A range begins with the robot at rest where it is held; a window within it, with a state that is less known.
-            let burn_in = if rows.start == range.start { 0.0 } else { burn_in };
             let compared = rows.clone().skip(1).find(|row| log.t[*row] - log.t[rows.start] >= burn_in);
             let Some(first_compared) = compared else { continue };
             let start = start(log, robot, range, rows.start, *base_orientation);

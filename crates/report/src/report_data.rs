@@ -1,7 +1,7 @@
 //! Data of the report: errors of the given and the extended model on one log, and the law of each cause.
 
 use twinstep_effects::ModelFile;
-use twinstep_effects::{EffectEntry, EntryError, Target, Visibility, apply_effects};
+use twinstep_effects::{Effect, EffectEntry, EntryError, Scope, Target, Visibility, apply_effects};
 use twinstep_identify::{
     Evaluation, ExperimentError, InverseDynamicsResidual, JointSeries, JointTrajectory, evaluate, position_errors,
 };
@@ -86,12 +86,12 @@ pub struct ReportData {
 }
 
 impl ReportData {
-    /// Simulates `log` with both models, and with the extended model without single entries where a residual plot needs
-    /// it.
+    /// Simulates `log` with both models, and with the extended model without single causes where a residual plot needs it.
     pub fn gather(
         log: &Log,
         given: &ModelFile,
         extended: &ModelFile,
+        causes: &[(&'static Effect, Scope)],
         simulator: &mut dyn Rollout,
         provenance: Provenance,
     ) -> Result<Self, EvidenceError> {
@@ -99,9 +99,9 @@ impl ReportData {
         let mut evaluator =
             LogEvaluator { log, joints: joint_commands(log)?, kinematics: JointTrajectory::of(log)?, simulator };
         let [first, second] = [evaluator.evaluate_model(&before)?, evaluator.evaluate_model(&after)?];
-        let laws = (0..extended.effects.len())
-            .filter(|index| !given.effects.contains(&extended.effects[*index]))
-            .map(|index| evaluator.law(&extended.effects[index], &without(given, extended, index)?, &after, &second))
+        let laws = causes
+            .iter()
+            .map(|cause| evaluator.law(*cause, &without(given, extended, *cause)?, &after, &second))
             .filter_map(Result::transpose)
             .collect::<Result<_, _>>()?;
         Ok(Self {
@@ -114,15 +114,15 @@ impl ReportData {
     }
 }
 
-/// Returns the extended model without one of its entries. The entry of the given model, if any, replaces it.
-fn without(given: &ModelFile, extended: &ModelFile, index: usize) -> Result<RobotModel, EntryError> {
-    let removed = &extended.effects[index];
-    let same = |entry: &&EffectEntry| entry.effect == removed.effect && entry.scope == removed.scope;
-    let mut entries = extended.effects.clone();
-    match given.effects.iter().find(same) {
-        Some(entry) if entries.iter().filter(same).count() == 1 => entries[index] = entry.clone(),
-        _ => drop(entries.remove(index)),
-    }
+/// Returns the extended model without an effect on the parts of a scope, as the given model has them.
+fn without(
+    given: &ModelFile,
+    extended: &ModelFile,
+    (effect, scope): (&Effect, Scope),
+) -> Result<RobotModel, EntryError> {
+    let is_removed = |entry: &&EffectEntry| entry.effect == effect && entry.scope.is_within(scope);
+    let kept = extended.effects.iter().filter(|entry| !is_removed(entry));
+    let entries: Vec<EffectEntry> = kept.chain(given.effects.iter().filter(is_removed)).cloned().collect();
     apply_effects(&given.nominal.model, &entries)
 }
 
@@ -156,15 +156,15 @@ impl LogEvaluator<'_> {
         Ok(cells)
     }
 
-    /// Returns the residual plot of `entry`, in the residual of [`best_residual`].
+    /// Returns the residual plot of a cause, in the residual of [`best_residual`].
     fn law(
         &mut self,
-        entry: &EffectEntry,
+        (effect, scope): (&'static Effect, Scope),
         without: &RobotModel,
         robot: &RobotModel,
         with: &ModelEvaluation,
     ) -> Result<Option<ResidualPlot>, EvidenceError> {
-        let (y_label, residuals) = match best_residual(self.log, entry) {
+        let (y_label, residuals) = match best_residual(self.log, effect) {
             Residual::Torque => {
                 let of =
                     |balance: &InverseDynamicsResidual| difference(&self.measured_torque(), &balance.estimated_torque);
@@ -181,7 +181,7 @@ impl LogEvaluator<'_> {
         };
         let [without, with] = &residuals;
         let (log, joints, kinematics) = (self.log, &self.joints, &self.kinematics);
-        Ok(Residuals { log, robot, joints, kinematics, y_label, without, with }.law(entry))
+        Ok(Residuals { log, robot, joints, kinematics, y_label, without, with }.law(effect, scope))
     }
 
     fn measured_torque(&self) -> JointSeries {
@@ -198,13 +198,13 @@ enum Residual {
     Position,
 }
 
-/// Returns the residual in which `entry` is most visible: torque for effects before the torque sensor, else motion.
-fn best_residual(log: &Log, entry: &EffectEntry) -> Residual {
+/// Returns the residual in which an effect is most visible: torque for effects before the torque sensor, else motion.
+fn best_residual(log: &Log, effect: &Effect) -> Residual {
     let fixed_base = log.segments().all(|(segment, _)| segment.base == twinstep_model::BaseMount::Fixed);
-    let of_joints = matches!(entry.effect.target, Target::Joints | Target::Supply);
+    let of_joints = matches!(effect.target, Target::Joints | Target::Supply);
     let measured = log.joints().iter().any(|joint| log.tau_measured(joint).is_some());
     let sensor = if measured { log.meta().tau_sensor } else { TorqueSensor::None };
-    match (entry.effect.visibility, sensor) {
+    match (effect.visibility, sensor) {
         (Visibility::Position, _) => Residual::Position,
         _ if !of_joints => Residual::Position,
         (Visibility::MotorTorque, TorqueSensor::MotorCurrent | TorqueSensor::JointOutput)

@@ -1,6 +1,6 @@
 //! Residual of a log over the variable that explains it, with the part that a cause explains.
 
-use twinstep_effects::{EffectEntry, Target, Variable};
+use twinstep_effects::{Effect, Scope, Target, Variable};
 use twinstep_identify::{JointSeries, JointTrajectory};
 use twinstep_logs::Log;
 use twinstep_logs::replay::{JointCommands, cell_or_zero};
@@ -92,11 +92,11 @@ pub struct Residuals<'a> {
 }
 
 impl Residuals<'_> {
-    /// Returns the residual plot of `entry`. Returns `None` if fewer than two bins have enough rows.
-    pub fn law(&self, entry: &EffectEntry) -> Option<ResidualPlot> {
-        let variable = entry.effect.explained_by;
-        let of_bodies = !matches!(entry.effect.target, Target::Joints | Target::Supply);
-        let is_affected = |joint: Joint| of_bodies || entry.scope.contains(joint);
+    /// Returns the residual plot of an effect. Returns `None` if fewer than two bins have enough rows.
+    pub fn law(&self, effect: &Effect, scope: Scope) -> Option<ResidualPlot> {
+        let variable = effect.explained_by;
+        let of_bodies = !matches!(effect.target, Target::Joints | Target::Supply);
+        let is_affected = |joint: Joint| of_bodies || scope.contains(joint);
         let mut points = Vec::new();
         for joint in self.joints.iter().filter(|joint| is_affected(joint.joint)) {
             let index = joint.joint.index();
@@ -110,7 +110,7 @@ impl Residuals<'_> {
             }
         }
         let bins = bins(points);
-        let cause = (entry.effect.name.to_owned(), entry.scope.to_string());
+        let cause = (effect.name.to_owned(), scope.to_string());
         (bins.len() > 1).then_some(ResidualPlot { cause, x_label: label(variable), y_label: self.y_label, bins })
     }
 }

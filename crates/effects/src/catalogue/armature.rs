@@ -14,7 +14,7 @@ pub const EFFECT: Effect = Effect {
         name: "inertia_kgm2",
         unit: "kg·m²",
         count: 1,
-        bounds: [-0.01, 0.5],
+        bounds: [-0.5, 0.5],
         prior_range: [0.0, 0.05],
         no_effect_value: 0.0,
         source: "identified on a real Go2: 0.001 to 0.018 on hips and thighs, 0.017 to 0.032 on calves; nominal value \

@@ -14,7 +14,7 @@ pub const EFFECT: Effect = Effect {
         name: "torque_nm",
         unit: "N·m",
         count: 1,
-        bounds: [0.0, 20.0],
+        bounds: [-20.0, 20.0],
         prior_range: [0.0, 1.5],
         no_effect_value: 0.0,
         source: "identified on a real Go2 with its feet in the air: 0.03 to 0.39 N·m on hips and thighs, 0.5 to 1.3 \

@@ -14,7 +14,7 @@ pub const EFFECT: Effect = Effect {
         name: "coefficient_nms",
         unit: "N·m·s/rad",
         count: 1,
-        bounds: [0.0, 5.0],
+        bounds: [-5.0, 5.0],
         prior_range: [0.0, 0.6],
         no_effect_value: 0.0,
         source: "unitree_mujoco has 0.1; identified robots 0.05 to 0.6",

@@ -14,7 +14,7 @@ use super::tree_shapes::{ShapeText, with_shapes};
 use super::tree_text::{Control, Joints, NominalGain, Pose, TreeGroups, TreeText};
 use crate::nominal::{BUILT_IN, JointsTable, NominalRobotError, is_robot_file};
 use crate::shipped_robots::{read_to_string, resolved};
-use crate::{Apply, CATALOGUE, Effect, parse_toml};
+use crate::{Apply, CATALOGUE, Effect, LEAST_SUM, parse_toml};
 
 /// A robot of any tree, and the effects at its joints.
 #[derive(Clone, Debug, PartialEq)]
@@ -405,7 +405,7 @@ fn impossible(joint: &JointModel) -> Option<&'static str> {
         ("a negative backlash", actuator.backlash),
         ("a negative dead zone", actuator.dead_zone),
     ];
-    let wrong = numbers.into_iter().find(|(_, value)| value.is_nan() || *value < 0.0).map(|(what, _)| what);
+    let wrong = numbers.into_iter().find(|(_, value)| value.is_nan() || *value < LEAST_SUM).map(|(what, _)| what);
     let moved = actuator.backlash > 0.0 || actuator.gear_stiffness.is_finite();
     wrong.or_else(|| (moved && joint.armature <= 0.0).then_some("backlash or gear elasticity without rotor inertia"))
 }

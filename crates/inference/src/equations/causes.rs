@@ -1,5 +1,6 @@
 //! Causes, and what a search finds.
 
+use super::residuals::Little;
 use super::site::Site;
 
 /// Standard deviation of a joint's value around that of its scope, where they are alike, relative to the prior's.
@@ -85,6 +86,8 @@ pub struct FoundCause {
     pub explained: f64,
     /// Causes in its place, with their evidence minus that of the cause [nat], the best first.
     pub rivals: Vec<(Cause, f64)>,
+    /// True if it is large enough to be reported. Else it only belongs to the fit.
+    pub is_large: bool,
 }
 
 /// A law that the catalogue does not have.
@@ -102,8 +105,10 @@ pub struct UnknownLaw {
 
 /// Result of a search.
 pub struct Found {
-    /// Causes, the strongest first.
+    /// Causes, those that are large first, each of them the strongest first.
     pub causes: Vec<FoundCause>,
+    /// What each joint has a little of.
+    pub little: Vec<Little>,
     /// Names of the equations, with the variance of what is left, relative to that of the sensors' noise: without and with the causes.
     pub left: Vec<(String, [f64; 2])>,
     /// Decisions, in order.

@@ -7,10 +7,11 @@ use nalgebra::{DMatrix, DVector};
 use super::block::{Block, SHAPES, Whitener};
 use super::causes::Cause;
 use super::gaussian::{Group, Posterior, posterior};
+use super::normal;
 use super::problem::Search;
 use super::residuals::{Change, Residuals, Small};
 use super::robot::Robot;
-use super::site::apply;
+use super::site::{apply, least};
 
 /// Change of an unknown, in its unit, below which a fit has converged.
 const CONVERGED: f64 = 0.02;
@@ -133,17 +134,18 @@ impl<R: Residuals> Search<'_, R> {
         let mut moved = causes.to_vec();
         for cause in &mut moved {
             let law = &self.laws[cause.law];
+            let least: Vec<f64> = cause.scope.sites.iter().map(|site| least(law, &self.base, *site)).collect();
             if law.is_positive {
-                log_allowed += log_allowed_of(cause, place, posterior);
+                log_allowed += log_allowed_of(cause, &least, law.units[0], place, posterior);
             }
-            for values in &mut cause.values {
+            for (values, least) in cause.values.iter_mut().zip(least) {
                 for (unknown, value) in values.iter_mut().enumerate() {
                     let shift = posterior.mean[place];
                     place += 1;
                     largest = largest.max(shift.abs() / law.units[unknown]);
                     *value += share * shift;
-                    if law.is_positive && unknown == 0 {
-                        *value = value.max(if law.strengths.is_empty() { 0.0 } else { 1e-3 });
+                    if unknown == 0 {
+                        *value = law.possible(*value, least);
                     }
                 }
             }
@@ -304,15 +306,19 @@ fn quadratic(groups: &[Group], values: &[f64]) -> f64 {
     sum
 }
 
-/// Returns the logarithm of the probability that the mean of a cause's first unknown is allowed.
-fn log_allowed_of(cause: &Cause, first: usize, posterior: &Posterior) -> f64 {
+/// Returns by how much the evidence changes because the first unknowns of a cause have least values: their mean where they are alike, else
+/// each.
+fn log_allowed_of(cause: &Cause, least: &[f64], unit: f64, first: usize, posterior: &Posterior) -> f64 {
     let (sites, size) = (cause.values.len(), cause.values[0].len());
     let index = |site: usize| first + site * size;
-    let mean = (0..sites).map(|site| cause.values[site][0] + posterior.mean[index(site)]).sum::<f64>() / sites as f64;
+    let mean = |site: usize| cause.values[site][0] + posterior.mean[index(site)];
+    let variance = |one: usize, other: usize| posterior.covariance[(index(one), index(other))];
+    if !cause.scope.is_alike {
+        let above = |site: usize| normal::log_above(least[site], mean(site), variance(site, site).sqrt(), unit);
+        return (0..sites).map(above).sum();
+    }
+    let count = sites as f64;
     let pairs = (0..sites).flat_map(|one| (0..sites).map(move |other| (one, other)));
-    let variance = pairs.map(|(one, other)| posterior.covariance[(index(one), index(other))]).sum::<f64>()
-        / (sites * sites) as f64;
-    let deviation = mean / variance.sqrt();
-    // The tail of the normal distribution: a bound that is exact far out.
-    if deviation > 0.0 { 0.0 } else { -0.5 * deviation * deviation - (1.0 - deviation).ln() }
+    let std = pairs.map(|(one, other)| variance(one, other)).sum::<f64>().sqrt() / count;
+    normal::log_above(least.iter().sum::<f64>() / count, (0..sites).map(mean).sum::<f64>() / count, std, unit)
 }

@@ -34,7 +34,7 @@ pub struct Law {
     pub place: Place,
     /// Prior standard deviation of each unknown, in its unit. Zero is no effect.
     pub units: Vec<f64>,
-    /// True if the first unknown cannot be negative.
+    /// True if the first unknown, or its sum with what the robot's file states, cannot be negative.
     pub is_positive: bool,
     /// Values of the only unknown that are tried, if the residuals are far from linear in it; else empty.
     pub strengths: Vec<f64>,
@@ -56,6 +56,11 @@ impl Law {
         values
     }
 
+    /// Returns the possible value of the first unknown that is closest to a value. A strength is never zero, where some effects are infinite.
+    pub fn possible(&self, value: f64, least: f64) -> f64 {
+        value.max(if self.strengths.is_empty() { least } else { LEAST_STRENGTH })
+    }
+
     /// Returns true if the parameters of the effect are within their bounds.
     pub fn allows(&self, unknowns: &[f64], shape: f64) -> bool {
         // The parameters of other bodies depend on the body.
@@ -69,6 +74,8 @@ impl Law {
     }
 }
 
+/// Least strength.
+const LEAST_STRENGTH: f64 = 1e-3;
 /// Strengths that are tried, relative to the end of the prior range.
 const STRENGTHS: [f64; 12] = [0.03, 0.06, 0.1, 0.15, 0.22, 0.32, 0.45, 0.6, 0.8, 1.0, 1.25, 1.6];
 

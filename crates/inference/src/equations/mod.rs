@@ -1,14 +1,16 @@
 //! Diagnosis by one likelihood: which effects of the catalogue a robot has that its model lacks.
 //!
-//! - [`explain`]: what explains a log, in the terms of the catalogue.
+//! - [`explain`]: what explains a log; [`explanation`]: in the terms of the catalogue. The model for predictions has all that was fitted; causes
+//!   are what of it the log shows with certainty.
 //! - [`measurements`]: the channels of a log; [`robot`]: what effects change.
 //! - [`residuals`]: residuals of a log, and the column of any change of the robot; [`site`]: where changes act.
 //! - [`torque_residuals`]: residuals of a log with torques, without simulation, from [`system`]. [`drive`]: the torque of each drive;
 //!   [`balance`]: the balance of each joint and of the base in [`samples`] of the log, with its [`columns`]; the gyroscope.
 //! - [`positions`]: residuals of a log without torques on a fixed base, by simulation; [`small_changes`]: what every robot has a little of.
-//! - [`gaussian`]: the evidence of residuals that are linear in unknowns with normal priors; [`block`]: the noise that is left.
+//! - [`gaussian`]: the evidence of residuals that are linear in unknowns with normal priors; [`block`]: the noise that is left;
+//!   [`normal`]: unknowns that have a least value.
 //! - [`law`]: an effect with its unknowns. [`nuisance`]: what every robot has a little of.
-//! - [`search`]: the set of causes of highest evidence, by [`screening`] of all effects and a [`fit`] of the best; [`imitations`]: causes that only imitate
+//! - [`search`]: the set of causes of highest evidence, by [`screening`] of all effects, a [`fit`] of the best, and its [`refinement`]; [`imitations`]: causes that only imitate
 //!   another law; [`outcome`]: what it found. [`unknown`]: functions that explain what the causes leave.
 
 mod balance;
@@ -17,17 +19,20 @@ mod causes;
 mod columns;
 mod drive;
 mod explain;
+mod explanation;
 mod fit;
 mod gaussian;
 mod imitations;
 mod law;
 mod measurements;
+mod normal;
 mod nuisance;
 mod outcome;
 #[cfg(test)]
 mod position_tests;
 mod positions;
 mod problem;
+mod refinement;
 mod residuals;
 mod robot;
 mod samples;
@@ -42,4 +47,5 @@ mod torque_residuals;
 mod unknown;
 
 pub use causes::UnknownLaw;
-pub use explain::{Explained, Explanation, OfJoint, explain, explain_tree, torque_error};
+pub use explain::{explain, explain_tree, torque_error};
+pub use explanation::{Explained, Explanation, OfJoint};

@@ -36,6 +36,8 @@ const SMALL: [(&str, &[f64]); 15] = [
 const SMALL_MOTION: [(&str, f64); 3] = [("encoder_offset", 0.0015), ("joint_elasticity", 2.5e-4), ("backlash", 0.002)];
 /// Standard deviation of the friction at low speed [N·m], for two speeds [rad/s].
 const LOW_SPEED: [(f64, f64); 2] = [(0.04, 0.2), (0.03, 0.8)];
+/// Standard deviation of the amplitude of a torque ripple, in phase and out of phase [N·m]: cogging of 0.1 % of the peak torque.
+const RIPPLE: f64 = 0.02;
 /// Standard deviation of the time by which the positions of an encoder are ahead of its velocities [s]: drives filter the velocity, and
 /// simulators update positions with the new one.
 const LEAD: f64 = 4e-4;
@@ -100,6 +102,7 @@ pub fn small_std(effect: &str, unknown: usize) -> f64 {
     let of_motion = SMALL_MOTION.iter().find(|(name, _)| *name == effect).map(|(_, std)| *std);
     let of_others = match effect {
         "stribeck_friction" => LOW_SPEED[0].0,
+        "torque_ripple" => RIPPLE,
         "com_shift" => BODY[2],
         // A second moment is the sum of two moments of inertia minus the third, half of it.
         "inertia" => 2.0 * BODY[1],

@@ -69,11 +69,17 @@ impl<R: Residuals> Search<'_, R> {
             };
             let explained = 1.0 - (sum(&best) / sum(&without)).sqrt();
             let gain = best.evidence - without.evidence;
-            causes.push(FoundCause { cause: cause.clone(), gain, stds, site_stds, explained, rivals });
+            let mut found =
+                FoundCause { cause: cause.clone(), gain, stds, site_stds, explained, rivals, is_large: false };
+            found.is_large = self.is_large(&found);
+            causes.push(found);
         }
-        // Places in the fit of the causes that are large, the strongest first.
-        let mut order: Vec<usize> = (0..causes.len()).filter(|index| self.is_large(&causes[*index])).collect();
-        order.sort_by(|one, other| causes[*other].gain.total_cmp(&causes[*one].gain));
+        // Places in the fit.
+        let mut order: Vec<usize> = (0..causes.len()).collect();
+        order.sort_by(|one, other| {
+            let [one, other] = [&causes[*one], &causes[*other]];
+            other.is_large.cmp(&one.is_large).then(other.gain.total_cmp(&one.gain))
+        });
         let pairs = (0..order.len()).flat_map(|one| (0..one).map(move |other| (other, one)));
         let correlation = |(one, other): (usize, usize)| {
             let [first, second] = [order[one], order[other]];
@@ -82,12 +88,15 @@ impl<R: Residuals> Search<'_, R> {
         };
         let correlations = pairs.map(correlation).collect();
         let causes = order.iter().map(|index| causes[*index].clone()).collect();
+        let stds: Vec<f64> = (0..first).map(|place| covariance[(place, place)].sqrt()).collect();
+        let little = self.system.little(&best.at, &stds);
         let left = best.blocks.iter().zip(&best.posterior.noise).zip(given);
         let left = left.map(|((block, noise), given)| (block.name.clone(), [*given, power(noise)])).collect();
         let unknown = self.unknown_laws(&best);
         Found {
             gains_differ: gains_differ(&best),
             causes,
+            little,
             left,
             decisions: std::mem::take(&mut self.decisions),
             unknown,
@@ -99,13 +108,22 @@ impl<R: Residuals> Search<'_, R> {
     ///
     /// Everything is a little present in every robot, so evidence alone does not make a cause.
     fn is_large(&self, found: &FoundCause) -> bool {
-        let sites = found.cause.values.len() as f64;
-        let mean = |unknown: usize| found.cause.values.iter().map(|values| values[unknown]).sum::<f64>() / sites;
-        let effect = self.laws[found.cause.law].effect.name;
-        let exceeds = |(unknown, std): (usize, &f64)| {
-            mean(unknown).abs() - TWO_SIDED_95 * nuisance::small_std(effect, unknown) > ONE_SIDED_95 * std
+        let FoundCause { cause, stds, site_stds, .. } = found;
+        let effect = self.laws[cause.law].effect.name;
+        let root_mean_square = |of: &dyn Fn(usize) -> f64| {
+            ((0..cause.values.len()).map(|site| of(site).powi(2)).sum::<f64>() / cause.values.len() as f64).sqrt()
         };
-        found.stds.iter().enumerate().any(exceeds)
+        let exceeds = |(unknown, mean): (usize, &f64)| {
+            // Values of their own cancel out in a mean.
+            let [size, std] = if cause.scope.is_alike {
+                [mean.abs(), stds[unknown]]
+            } else {
+                let size = root_mean_square(&|site| cause.values[site][unknown]);
+                [size, root_mean_square(&|site| site_stds[site][unknown])]
+            };
+            size - TWO_SIDED_95 * nuisance::small_std(effect, unknown) > ONE_SIDED_95 * std
+        };
+        cause.mean().iter().enumerate().any(exceeds)
     }
 
     /// Returns the joints at which functions of what they measure explain what the causes leave.

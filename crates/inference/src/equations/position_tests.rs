@@ -6,7 +6,8 @@ use std::sync::atomic::AtomicBool;
 use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
 use twinstep_model::{BaseMount, CONTACT, RobotModel, TreeModel, go2};
 
-use super::explain::{Explained, explain};
+use super::explain::explain;
+use super::explanation::Explained;
 use super::robot::Robot;
 use crate::{Candidate, JointLog, WindowLength, simulate, windows};
 
@@ -42,7 +43,9 @@ fn log(robot: &RobotModel) -> Log {
 }
 
 fn explained(robot: &RobotModel) -> Explained {
-    explain(&log(robot), &go2(), |_| true, &mut |_| true).expect("a fixed base").expect("not interrupted")
+    explain(&log(robot), &go2(), &std::sync::Arc::default(), |_| true, &mut |_| true)
+        .expect("a fixed base")
+        .expect("not interrupted")
 }
 
 #[test]

@@ -12,7 +12,7 @@ use twinstep_model::{CONTACT, JointModel, RobotTree, TreeModel};
 use super::block::{Block, Column};
 use super::gaussian::Group;
 use super::law::{Law, Place};
-use super::residuals::{Change, Residuals, Small, State};
+use super::residuals::{Change, Little, Residuals, Small, State};
 use super::robot::Robot;
 use super::small_changes::{SmallChange, SmallUnknown, small_unknowns};
 use crate::{Candidate, InferenceError, JointLog, Trace, Window, WindowLength, simulate, windows};
@@ -196,7 +196,7 @@ impl Residuals for Positions {
         ];
         let start = |of: Parameter| {
             let pairs = self.drives.estimates.as_ref()?.iter().zip(&self.given);
-            Some(pairs.map(|(now, before)| (of(now) - of(before)).max(0.0)).collect())
+            Some(pairs.map(|(now, before)| of(now) - of(before)).collect())
         };
         estimates.map(|(name, of)| (name, start(of))).to_vec()
     }
@@ -268,6 +268,21 @@ impl Residuals for Positions {
             small.change.apply(laws, robot, *value);
         }
         true
+    }
+
+    fn little(&self, values: &[f64], stds: &[f64]) -> Vec<Little> {
+        let mut all: Vec<Little> = Vec::new();
+        for ((small, value), std) in self.small.iter().zip(values).zip(stds) {
+            let SmallChange::OfLaw { law, joint, .. } = small.change else { continue };
+            match all.last_mut() {
+                Some(last) if last.law == law && last.joint == joint => {
+                    last.unknowns.push(*value);
+                    last.stds.push(*std);
+                }
+                _ => all.push(Little { law, joint, unknowns: vec![*value], stds: vec![*std] }),
+            }
+        }
+        all
     }
 
     fn places(&self) -> &[Place] {

@@ -9,6 +9,9 @@ use super::robot::Robot;
 /// Prior probability that an effect is a cause.
 pub const EFFECT_PROBABILITY: f64 = 1.0 / 12.0;
 
+/// Prior probability that every joint has its own of a usual effect. That they are alike is three times as probable.
+const USUAL_PROBABILITY: f64 = 0.2;
+
 /// Prior probability of a law that the catalogue does not have at a joint.
 pub const UNKNOWN_PROBABILITY: f64 = 0.001;
 
@@ -37,6 +40,16 @@ impl<'a, R: Residuals> Search<'a, R> {
     /// Prepares a search for what `base` lacks.
     pub fn new(system: &'a R, laws: &'a [Law], scopes: Vec<ScopeSites>, base: Robot) -> Self {
         Self { system, laws, scopes, base, decisions: Vec::new(), removed: Vec::new(), rivals: Vec::new() }
+    }
+
+    /// Returns the logarithm of the prior probability of a law on a scope.
+    pub fn log_prior(&self, law: usize, scope: &ScopeSites) -> f64 {
+        let name = self.laws[law].effect.name;
+        let is_usual = self.system.usual().iter().any(|(usual, _)| *usual == name);
+        if is_usual && scope.sites.len() == self.base.joints.len() {
+            return (USUAL_PROBABILITY * if scope.is_alike { 3.0 } else { 1.0 }).ln();
+        }
+        EFFECT_PROBABILITY.ln() + scope.probability.ln()
     }
 }
 

@@ -48,6 +48,18 @@ impl Small {
     }
 }
 
+/// What a joint has a little of.
+pub struct Little {
+    /// Index of the law.
+    pub law: usize,
+    /// Index of the joint.
+    pub joint: usize,
+    /// Unknowns of the law.
+    pub unknowns: Vec<f64>,
+    /// Their standard deviations.
+    pub stds: Vec<f64>,
+}
+
 /// Residuals of a log.
 pub trait Residuals: Sync {
     /// What a robot has, from which residuals and columns are computed.
@@ -85,6 +97,10 @@ pub trait Residuals: Sync {
     ///
     /// Returns false if the residuals are linear in them: then they stay at zero.
     fn apply_small(&self, laws: &[Law], robot: &mut Robot, values: &mut [f64]) -> bool;
+
+    /// Returns what each joint has a little of, given the values of the small unknowns and their standard deviations. Nothing if the
+    /// residuals are linear in them.
+    fn little(&self, values: &[f64], stds: &[f64]) -> Vec<Little>;
 
     /// Returns the equations that tell laws at a joint apart.
     fn places(&self) -> &[Place];

@@ -8,9 +8,10 @@ use super::causes::{Cause, ScopeSites};
 use super::fit::Fitted;
 use super::gaussian::{Group, Scores, gain};
 use super::law::Law;
-use super::problem::{EFFECT_PROBABILITY, Search};
+use super::normal;
+use super::problem::Search;
 use super::residuals::{Change, Residuals};
-use super::site::{Site, apply};
+use super::site::{Site, apply, least};
 
 /// Standard deviation of a strength around one that is tried, relative to it.
 const CELL: f64 = 0.3;
@@ -174,13 +175,25 @@ impl<R: Residuals> Search<'_, R> {
             });
             let (gain, posterior, spread) = gain(&with_residual, &inner, &mean, &covariance);
             let variants = self.variants(law_index) as f64;
-            let mut log_prior = EFFECT_PROBABILITY.ln() + scope.probability.ln();
+            let log_prior = self.log_prior(law_index, scope);
             let mut log_grid = -variants.ln();
+            let least = |site: Site| least(law, &self.base, site);
             if law.is_positive {
-                // The half of the prior that is allowed has twice the density.
-                let deviation = posterior.sum() / (spread.sum().sqrt() + 1e-12);
-                log_prior += std::f64::consts::LN_2;
-                log_grid += if deviation < 0.0 { -0.5 * deviation * deviation } else { 0.0 };
+                // Posterior and prior are relative to a strength that is tried.
+                let prior = if is_strength { 1.0 } else { law.units[0] };
+                let bound = |row: usize| least(candidates[own[members[row]]].site);
+                let first = (0..size).filter(|row| candidates[own[members[*row]]].unknown == 0);
+                log_grid += if scope.is_alike {
+                    let count = first.clone().count() as f64;
+                    let mean = first.clone().map(|row| posterior[row]).sum::<f64>() / count;
+                    let pairs = first.clone().flat_map(|one| first.clone().map(move |other| (one, other)));
+                    let std = pairs.map(|(one, other)| spread[(one, other)]).sum::<f64>().sqrt() / count;
+                    normal::log_above(first.map(bound).sum::<f64>() / count, mean, std, prior)
+                } else {
+                    first
+                        .map(|row| normal::log_above(bound(row), posterior[row], spread[(row, row)].sqrt(), prior))
+                        .sum()
+                };
             }
             let mut values = vec![vec![0.0; law.units.len()]; scope.sites.len()];
             for (row, member) in members.iter().enumerate() {
@@ -189,7 +202,7 @@ impl<R: Residuals> Search<'_, R> {
                 let strength = law.strengths.get(candidate.variant).copied().unwrap_or(1.0);
                 let value = strength * posterior[row];
                 values[site][candidate.unknown] =
-                    if law.is_positive && candidate.unknown == 0 { value.max(1e-3 * strength) } else { value };
+                    if candidate.unknown == 0 { law.possible(value, least(candidate.site)) } else { value };
             }
             let shape = law.shapes.get(variant).copied().unwrap_or(law.shapes[0]);
             let log_shapes = -(law.shapes.len() as f64).ln();

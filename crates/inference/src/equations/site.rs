@@ -66,6 +66,15 @@ pub fn apply(robot: &mut Robot, law: &Law, site: Site, unknowns: &[f64], shape: 
     }
 }
 
+/// Returns the least first unknown of a law at a site of a robot: what its file states may be too much.
+pub fn least(law: &Law, robot: &Robot, site: Site) -> f64 {
+    let amount = match site {
+        Site::Joint(joint) => law.effect.amount(&robot.joints[joint]) / robot.scale[joint],
+        Site::Base => 0.0,
+    };
+    if law.is_positive { -amount } else { f64::NEG_INFINITY }
+}
+
 /// Returns the index of the body at a site.
 pub fn body_of(site: Site) -> usize {
     match site {

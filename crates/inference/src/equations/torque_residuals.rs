@@ -4,7 +4,7 @@ use rayon::prelude::*;
 
 use super::block::{Block, Column};
 use super::law::{Law, Place};
-use super::residuals::{Change, Residuals, Small, State};
+use super::residuals::{Change, Little, Residuals, Small, State};
 use super::robot::Robot;
 use super::system::{Predicted, System};
 use super::{nuisance, unknown};
@@ -53,6 +53,10 @@ impl Residuals for System {
 
     fn apply_small(&self, _: &[Law], _: &mut Robot, _: &mut [f64]) -> bool {
         false
+    }
+
+    fn little(&self, _: &[f64], _: &[f64]) -> Vec<Little> {
+        Vec::new()
     }
 
     fn places(&self) -> &[Place] {

@@ -32,7 +32,8 @@ pub fn evidence(log: &Log, extended: &ModelFile) -> ReportData {
         logs: vec![LogFacts::of(RECORDING, log)],
         motions: vec!["motion_before.html".to_owned()],
     };
-    ReportData::gather(log, &ModelFile::default(), extended, &mut simulator, provenance).unwrap()
+    let causes: Vec<_> = extended.effects.iter().map(|entry| (entry.effect, entry.scope)).collect();
+    ReportData::gather(log, &ModelFile::default(), extended, &causes, &mut simulator, provenance).unwrap()
 }
 
 /// Returns a model file with entries of name, scope, parameter and value.

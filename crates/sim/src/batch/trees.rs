@@ -46,7 +46,7 @@ impl SimdTask for MakeBatches<'_> {
         let batch = RobotBatch::new(self.robot, self.actuator_dt, self.config, &ground, self.initial_state);
         let (shape, count) = (batch.workspace_shape(), self.num_robots.div_ceil(T::LANES));
         let shapes = self.robot.points.iter().map(|point| point.shape).collect();
-        Box::new(Trees::<T> { shape, batches: vec![batch; count], shapes })
+        Box::new(Trees::<T> { workspace: shape.workspace(), shape, batches: vec![batch; count], shapes })
     }
 }
 
@@ -57,6 +57,8 @@ type Robots<'a, T> = (&'a mut TreeBatch<T>, (&'a [TreeCommand], &'a mut [TreeRea
 struct Trees<T: SimdFloat> {
     batches: Vec<TreeBatch<T>>,
     shape: WorkspaceShape<T, TreeEquations<T>>,
+    /// Workspace of steps on one thread.
+    workspace: Workspace<T, TreeEquations<T>>,
     /// Shape of each contact point.
     shapes: Vec<usize>,
 }
@@ -85,7 +87,7 @@ impl<T: SimdFloat> TreeEngine for Trees<T> {
         parallel: bool,
     ) -> Result<(), TreeError> {
         let count = StepCount { actuator_periods, steps };
-        let Self { batches, shape, shapes } = self;
+        let Self { batches, shape, workspace, shapes } = self;
         let one = |workspace: &mut Workspace<T, TreeEquations<T>>, (batch, (commands, states)): Robots<'_, T>| {
             let mut input = SimdCommands::zero(batch.tau().len());
             for (lane, TreeCommand { q, dq, tau_ff, kp, kd }) in commands.iter().enumerate() {
@@ -100,9 +102,8 @@ impl<T: SimdFloat> TreeEngine for Trees<T> {
             let robots = commands.par_chunks(T::LANES).zip(states.par_chunks_mut(T::LANES));
             batches.par_iter_mut().zip(robots).for_each_init(|| shape.workspace(), one);
         } else {
-            let mut workspace = shape.workspace();
             let robots = commands.chunks(T::LANES).zip(states.chunks_mut(T::LANES));
-            batches.iter_mut().zip(robots).for_each(|robots| one(&mut workspace, robots));
+            batches.iter_mut().zip(robots).for_each(|robots| one(workspace, robots));
         }
         Ok(())
     }
