@@ -46,7 +46,7 @@ pub enum EntryError {
         high: f64,
     },
     /// Entries that apply to the same joint or body cannot be combined.
-    #[error("`{effect}` on {scope} conflicts with another entry: {reason}")]
+    #[error("`{effect}` on {scope} conflicts with another entry or the robot: {reason}")]
     Conflict {
         /// The effect.
         effect: &'static str,

@@ -186,6 +186,11 @@ impl Effect {
         }
     }
 
+    /// Returns true if values add up to a sum that cannot be negative.
+    pub fn is_of_sum(&self) -> bool {
+        matches!(self.name, "coulomb_friction" | "viscous_friction" | "armature")
+    }
+
     /// Returns what a joint has of an effect whose values add up to a sum that cannot be negative: an entry can take away that much.
     pub fn amount(&self, joint: &JointModel) -> f64 {
         match self.name {

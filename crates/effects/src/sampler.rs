@@ -12,7 +12,7 @@ const CENTRAL: f64 = 1.96;
 /// Samples robots from the intervals of a model file.
 ///
 /// A value with an interval is normally distributed with that interval as its central 95 %, clipped to the parameter's
-/// bounds. Values without an interval are constant. All values are independent. Samples that are not valid robots are
+/// bounds; friction and armature are clipped at zero, or at a stated value below it. Values without an interval are constant. All values are independent. Samples that are not valid robots are
 /// rejected, for example if delays add up to more than [`twinstep_model::ActuatorParams::MAX_DELAY`] or a mass is not
 /// positive.
 #[derive(Clone, Debug, PartialEq)]
@@ -98,7 +98,11 @@ fn sampled(effect: &Effect, values: &[f64], intervals: &[Option<[f64; 2]>], rand
     let mut values = values.to_vec();
     for ((value, interval), parameter) in values.iter_mut().zip(intervals).zip(parameters) {
         if let Some([low, high]) = interval {
-            let [least, most] = parameter.bounds;
+            let [mut least, most] = parameter.bounds;
+            if effect.is_of_sum() {
+                // What the file takes away is possible, more may not be.
+                least = least.max(value.min(0.0));
+            }
             let std = (high - low) / (2.0 * CENTRAL);
             *value = (0.5 * (low + high) + std * standard_normal(random)).clamp(least, most);
         }
@@ -180,7 +184,7 @@ mod tests {
         let error = draws(&delays(0.06)).expect_err("refused");
         expect![[
             "only 19 of 100 samples from the intervals of the model file are valid robots; at least half must be \
-                  valid. One is not: `command_delay` on hip conflicts with another entry: the delays of a joint add \
+                  valid. One is not: `command_delay` on hip conflicts with another entry or the robot: the delays of a joint add \
                   up to more than 0.04 s. Make the intervals narrower"
         ]]
         .assert_eq(&error.to_string());

@@ -106,8 +106,10 @@ fn errors_in_an_effect_contain_the_allowed_values() {
         &expect![[r#"robot.toml: effect 1: `torque_nm` is "much"; expected a number"#]],
     );
     check_refusal(
-        &format!("{FRICTION}torque_nm = -1"),
-        &expect![[r#"robot.toml: effect 1: `coulomb_friction` on RR_thigh: `torque_nm` = -1 is not allowed: 0 to 20"#]],
+        &format!("{FRICTION}torque_nm = 21"),
+        &expect![[
+            r#"robot.toml: effect 1: `coulomb_friction` on RR_thigh: `torque_nm` = 21 is not allowed: -20 to 20"#
+        ]],
     );
     check_refusal(
         &format!("{FRICTION}torque_nm = 1\ntorque = 1"),
