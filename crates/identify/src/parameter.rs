@@ -2,7 +2,7 @@
 
 use twinstep_effects::ModelFile;
 use twinstep_effects::{Composition, Effect, EffectEntry, EntryError, Scope};
-use twinstep_model::RobotModel;
+use twinstep_model::{Joint, RobotModel};
 
 /// Prior standard deviations of log-Cholesky coordinates `[α, d1, d2, d3, s12, s23, s13, t1, t2, t3]`.
 ///
@@ -66,6 +66,7 @@ pub fn free_parameters(
     effects: &[(&'static Effect, Scope)],
 ) -> Result<(ModelFile, Vec<FreeParameter>), EntryError> {
     let (mut file, mut unknowns) = (model.clone(), Vec::new());
+    let robot = model.robot_model()?;
     // Before an entry is added, so that the index of each stays valid.
     let is_replaced = |entry: &EffectEntry| {
         entry.effect.composition == Composition::Replace && effects.contains(&(entry.effect, entry.scope))
@@ -96,6 +97,13 @@ pub fn free_parameters(
                 let inverse = parameter.no_effect_value.is_infinite();
                 let [low, high] = parameter.prior_range.map(|value| if inverse { 1.0 / value } else { value });
                 let (low, high) = if inverse { (0.0, low) } else { (low, high) };
+                let [mut least, most] = parameter.bounds;
+                if effect.is_of_sum() {
+                    // No joint has less than nothing.
+                    let joints = Joint::ALL.into_iter().filter(|joint| scope.contains(*joint));
+                    let amounts = joints.map(|joint| effect.amount(&robot.joints[joint.index()]));
+                    least = least.max(-amounts.fold(f64::INFINITY, f64::min));
+                }
                 let inertia = effect.replaces_body();
                 let mean = if inertia { start[component_index] } else { 0.5 * (low + high) };
                 let std = if inertia { INERTIA_PRIOR[component_index] } else { (high - low).abs() / 3.92 };
@@ -108,7 +116,7 @@ pub fn free_parameters(
                         format!("{}.{component}", parameter.name)
                     },
                     unit: parameter.unit,
-                    bounds: parameter.bounds,
+                    bounds: [least, most],
                     neutral: parameter.no_effect_value,
                     prior: [mean, std],
                     inverse,
