@@ -121,7 +121,7 @@ fn effects_that_caveats_mention_are_in_the_catalogue() {
 fn friction_adds_up_where_scopes_overlap() {
     let entries = [entry("coulomb_friction", "all", &[0.1]), entry("coulomb_friction", "RR_thigh", &[0.4])];
     let robot = apply_effects(&go2(), &entries).expect("no conflict");
-    for (joint, model) in twinstep_model::Joint::ALL.iter().zip(&robot.joints) {
+    for (joint, model) in Joint::ALL.iter().zip(&robot.joints) {
         let expected = if joint.name() == "RR_thigh" { 0.5 } else { 0.1 };
         assert!((model.coulomb_friction - expected).abs() < 1e-12, "{}", joint.name());
     }
