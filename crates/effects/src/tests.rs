@@ -217,10 +217,15 @@ fn friction_can_be_less_than_the_file_states_and_never_less_than_none() {
     let mut robot = go2();
     robot.joints[2].viscous_friction = 0.3;
     let entry = |value| {
-        EffectEntry::new(Effect::named("viscous_friction").unwrap(), Scope::Joint(Joint::ALL[2]), vec![value]).unwrap()
+        EffectEntry::new(
+            Effect::named("viscous_friction").expect("in the catalogue"),
+            Scope::Joint(Joint::ALL[2]),
+            vec![value],
+        )
+        .expect("within its bounds")
     };
-    let less = apply_effects(&robot, &[entry(-0.2)]).unwrap();
+    let less = apply_effects(&robot, &[entry(-0.2)]).expect("some friction is left");
     assert!((less.joints[2].viscous_friction - 0.1).abs() < 1e-12);
-    let error = apply_effects(&robot, &[entry(-0.4)]).unwrap_err();
+    let error = apply_effects(&robot, &[entry(-0.4)]).expect_err("no friction is left");
     assert!(error.to_string().contains("less than zero"), "{error}");
 }
