@@ -8,7 +8,9 @@ use std::sync::atomic::AtomicBool;
 
 use twinstep_diagnose::{Diagnosis, ParameterValue};
 use twinstep_effects::{Effect, JointEffect, JointScope, NominalGain, TreeModelFile};
-use twinstep_inference::{Candidate, IdentifyOptions, JointLog, ParameterRequest, evaluate, identify};
+use twinstep_inference::{
+    Candidate, IdentifyOptions, JointLog, ParameterRequest, WindowLength, evaluate, identify, windows,
+};
 use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
 use twinstep_model::{BaseMount, TreeModel};
 use twinstep_sim::{Placement, SimConfig, SimdPrecision, TreeCommand, TreeSimulation};
@@ -136,13 +138,17 @@ fn only_unknown_gains_become_those_of_the_model_file_and_other_joints_keep_their
 }
 
 #[test]
-fn selections_that_are_too_short_gaps_and_missing_cells_are_no_panic() {
+fn short_selections_gaps_and_missing_cells_are_no_panic() {
     let (file, whole) = (arm(), log(4.0));
     let short = JointLog::new(&whole, &file.nominal.tree, |row| (100..120).contains(&row)).unwrap();
     let requests = vec![ParameterRequest("armature@all".to_owned())];
     let options = IdentifyOptions { requests, actuator_hz: 1000.0, stop: Arc::default() };
-    let error = identify(&file, &short, &options, &mut |_, _, _| {}).unwrap_err().to_string();
-    assert!(error.contains("shorter than 0.4 s"), "{error}");
+    let all = JointLog::new(&whole, &file.nominal.tree, |_| true).unwrap();
+    let [of_short, of_all] = [short, all].map(|log| {
+        let [low, high] = identify(&file, &log, &options, &mut |_, _, _| {}).unwrap().estimates[0].interval;
+        high - low
+    });
+    assert!(of_short > 2.0 * of_all, "0.1 s tell less than 4 s: {of_short} and {of_all} kg·m²");
 
     let mut columns = columns_of(&whole);
     columns.insert("dq_gripper".to_owned(), vec![f64::NAN; whole.rows()]);
@@ -249,6 +255,18 @@ fn log_with_gains() -> Log {
     let log = log(8.0);
     let meta = Meta { kp: Some(Gain::Uniform(KP)), kd: Some(Gain::Uniform(KD)), ..log.meta().clone() };
     Log::new(meta, columns_of(&log)).unwrap()
+}
+
+#[test]
+fn start_of_a_window_is_not_compared_and_a_short_one_is_compared_in_its_second_half() {
+    let tree = arm().nominal.tree;
+    for (seconds, unseen) in [(8.0, 0.4), (0.3, 0.15)] {
+        let joint_log = JointLog::new(&log(seconds), &tree, |_| true).unwrap();
+        for window in windows(&joint_log, &tree, WindowLength::IDENTIFICATION) {
+            let after = joint_log.t[window.first_compared] - joint_log.t[window.rows.start];
+            assert!((after - unseen).abs() < 0.015, "{after} s of a log of {seconds} s");
+        }
+    }
 }
 
 #[test]

@@ -460,13 +460,10 @@ fn simulator_predicts_the_next_step_of_the_robot_within_the_noise_of_its_sensors
     std::fs::write(file("nominal.toml"), "robot = \"go2\"\n").unwrap();
     let other = "robot = \"go2\"\n[[effect]]\nname = \"coulomb_friction\"\nscope = \"all\"\ntorque_nm = 1.0\n";
     std::fs::write(file("other.toml"), other).unwrap();
-    // Where this computer stands still, commands arrive late: hence the median, and another recording if half of one is late.
-    let mut errors = (0..3).map(|_| {
-        record_walk(&file("nominal.toml"), "0.5,0,0", &file("walk.mcap"));
-        [file("nominal.toml"), file("other.toml")].map(|model| one_step_error(&model, &file("walk.mcap")))
-    });
-    // The noise of the encoders is 0.0005 rad at the beginning and at the end, and 0.02 rad/s for up to 20 ms.
-    let [error, error_of_other] =
-        errors.find(|[error, _]| *error < 0.0008).expect("one of three recordings is in time");
-    assert!(error_of_other > 1.3 * error, "{error} rad, with friction {error_of_other} rad");
+    record_walk(&file("nominal.toml"), "0.5,0,0", &file("walk.mcap"));
+    let error = one_step_error(&file("nominal.toml"), &file("walk.mcap"));
+    let error_of_other = one_step_error(&file("other.toml"), &file("walk.mcap"));
+    // The median and not the mean square: where this computer stood still, commands arrived late. The noise of the encoders
+    // is 0.0005 rad at the beginning and at the end, and 0.02 rad/s for up to 20 ms.
+    assert!(error < 0.0008 && error_of_other > 1.3 * error, "{error} rad, with friction {error_of_other} rad");
 }

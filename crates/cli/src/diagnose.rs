@@ -283,6 +283,13 @@ fn text(diagnosis: &Diagnosis, out: &Path) -> String {
         lines.push("no cause identified".to_owned());
     }
     lines.extend(joint_gains(diagnosis));
+    if !diagnosis.also_fitted.is_empty() && !diagnosis.extended_model.is_empty() {
+        lines.push(format!(
+            "{} also has {} entries that are too small or too uncertain for a name: `also_fitted` in findings.json",
+            diagnosis.extended_model,
+            diagnosis.also_fitted.len()
+        ));
+    }
     lines.push(diagnosis.unexplained.text.clone());
     if let Some(learned) = &diagnosis.learned_residual {
         lines.push(format!(

@@ -16,7 +16,7 @@ use twinstep_model::{JOINT_NAMES, Joint, Rollout};
 
 use super::cross_validation::{Accepted, CandidateFit};
 use super::data_split::fitted_rows;
-use super::explained::{AMBIGUOUS, LEAST_GAIN, confusable, finding, unexplained_law};
+use super::explained::{AMBIGUOUS, LEAST_GAIN, also_fitted, confusable, finding, unexplained_law};
 use super::findings::Diagnosis;
 use super::hypothesis::Hypothesis;
 use super::joint_gains::JointGains;
@@ -69,12 +69,14 @@ pub fn diagnose_by_equations(
     let pairs = experiment_design::pairs(&extended, &accepted, &confusable);
     let next = experiment_design::next_motion(&pairs, &evidence, &robot, simulator);
     let unexplained = unexplained_law(&found);
+    let joints = JOINT_NAMES.map(str::to_owned);
     let diagnosis = Diagnosis {
         baseline: baseline?,
         extended: after?,
         noise_floor: reporting::noise_floor(&evidence),
-        findings: found.causes.iter().map(|cause| finding(cause, &JOINT_NAMES.map(str::to_owned))).collect(),
+        findings: found.causes.iter().map(|cause| finding(cause, &joints)).collect(),
         joint_gains: gains.map_or(BTreeMap::new(), |gains| gains.by_joint()),
+        also_fitted: also_fitted(&found, &joints),
         confusable,
         unexplained,
         learned_residual: None,

@@ -43,6 +43,18 @@ pub fn unexplained_law(found: &Explained) -> Unexplained {
     Unexplained { fraction: found.left, depends_on: vec![channel], text }
 }
 
+/// Returns the entries of the extended model that are no cause. `joints` are the names of the robot's joints.
+pub fn also_fitted(found: &Explained, joints: &[String]) -> Vec<String> {
+    let entries = |one: &Explanation| -> Vec<String> {
+        let name = |scope: &str| format!("{}@{scope}", one.effect.name);
+        if one.by_joint.is_empty() {
+            return vec![name(&one.scope)];
+        }
+        one.by_joint.iter().map(|own| name(&joints[own.joint])).collect()
+    };
+    found.unnamed.iter().flat_map(entries).collect()
+}
+
 /// Returns the pairs of causes whose estimates are highly correlated.
 pub fn confusable(found: &Explained) -> Vec<CorrelatedPair> {
     let is_high = |(one, other, correlation): &&(usize, usize, f64)| {

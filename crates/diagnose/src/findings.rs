@@ -19,6 +19,10 @@ pub struct Diagnosis {
     /// those of equal motors. They are no cause; the extended model has them. Empty if they do not differ.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub joint_gains: BTreeMap<String, [f64; 2]>,
+    /// Entries of the extended model that are no cause, as `effect@scope`: they belong to the best fit, and are too small or too uncertain
+    /// for a name.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub also_fitted: Vec<String>,
     /// Pairs of causes with highly correlated estimates.
     pub confusable: Vec<CorrelatedPair>,
     /// Unexplained residual.

@@ -221,6 +221,7 @@ pub fn diagnose(
         noise_floor: reporting::noise_floor(evidence),
         findings: causes,
         joint_gains: joint_gains.map_or(BTreeMap::new(), |gains| gains.by_joint()),
+        also_fitted: Vec::new(),
         confusable,
         unexplained,
         learned_residual: None,

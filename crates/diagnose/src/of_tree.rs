@@ -12,7 +12,7 @@ use twinstep_logs::Log;
 use twinstep_model::TreeModel;
 
 use super::data_split::fitted_rows;
-use super::explained::{confusable, finding, unexplained_law};
+use super::explained::{also_fitted, confusable, finding, unexplained_law};
 use super::findings::{Diagnosis, RmsErrors};
 use super::{DiagnoseError, DiagnoseProgress, held_out_rows};
 
@@ -62,6 +62,7 @@ pub fn diagnose_tree(
         noise_floor: noise_floor(&joined),
         findings: found.causes.iter().map(|cause| finding(cause, &joints)).collect(),
         joint_gains: std::collections::BTreeMap::new(),
+        also_fitted: also_fitted(&found, &joints),
         confusable: confusable(&found),
         unexplained: unexplained_law(&found),
         learned_residual: None,

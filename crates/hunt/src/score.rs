@@ -263,6 +263,7 @@ mod tests {
             noise_floor: RmsErrors::default(),
             findings,
             joint_gains: BTreeMap::new(),
+            also_fitted: Vec::new(),
             confusable: Vec::new(),
             unexplained: Unexplained::default(),
             learned_residual: None,

@@ -43,9 +43,6 @@ pub enum InferenceError {
          floating base needs a quadruped like the Go2, and gains in the log"
     )]
     NothingToSimulate,
-    /// The selected rows within a range are shorter than the time in which an initial state decays.
-    #[error("the selected rows are shorter than 0.4 s: select more with `--from`, `--until` and `--segment`")]
-    TooShort,
     /// The name is not one of a quantity that can be estimated.
     #[error(
         "`{given}` cannot be estimated; possible: {possible}, each with @all, @each or @JOINT, as in coulomb_friction@each"

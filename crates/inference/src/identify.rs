@@ -62,9 +62,6 @@ pub fn identify(
     let given = Candidate::of(file)?;
     let parameters = FreeParameter::of(&options.requests, file, log)?;
     let windows = windows(log, &given.robot.tree, WindowLength::IDENTIFICATION);
-    if windows.is_empty() {
-        return Err(InferenceError::TooShort);
-    }
     let mut problem = FitProblem::new(log, &windows, &parameters, &given, options);
     let is_stopped = || options.stop.load(Ordering::Relaxed);
     let few: Vec<_> = windows.iter().step_by(windows.len().div_ceil(START_WINDOWS)).cloned().collect();

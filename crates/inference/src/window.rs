@@ -18,7 +18,7 @@ pub enum WindowLength {
     Seconds {
         /// Length of a window [s].
         length: f64,
-        /// Length of its first part [s]; none at the start of a range.
+        /// Length of its first part [s]; at most half of the window.
         burn_in: f64,
     },
 }
@@ -53,6 +53,7 @@ pub fn windows(log: &JointLog, robot: &RobotTree, length: WindowLength) -> Vec<W
         for part in 0..parts {
             let at = |part: usize| selected.start + (selected.len() - 1) * part / parts;
             let rows = at(part)..at(part + 1) + 1;
+            let burn_in = burn_in.min(0.5 * (log.t[rows.end - 1] - log.t[rows.start]));
             let compared = rows.clone().skip(1).find(|row| log.t[*row] - log.t[rows.start] >= burn_in);
             let Some(first_compared) = compared else { continue };
             let start = start(log, robot, range, rows.start, *base_orientation);

@@ -95,11 +95,6 @@ impl Terms<'_> {
             exported.filter(|(_, one)| one.by_joint.is_empty()).map(|(found, _)| &found.cause).collect();
         let little = found.little.into_iter().map(|one| beside(one, &alike)).collect::<Vec<_>>();
         unnamed.extend(self.little(&little));
-        let mut decisions = found.decisions;
-        if !unnamed.is_empty() {
-            let names: Vec<String> = unnamed.iter().map(|one| format!("{}@{}", one.effect.name, one.scope)).collect();
-            decisions.push(format!("in the model, and no cause: {}", names.join(", ")));
-        }
         let is_named = |(one, other, _): &(usize, usize, f64)| *one < named && *other < named;
         let excess = |power: f64| (power - UNEXPLAINED).max(0.0);
         let sum = |side: usize| found.left.iter().map(|(_, powers)| excess(powers[side])).sum::<f64>();
@@ -109,7 +104,7 @@ impl Terms<'_> {
             is_of_positions: false,
             unknown: found.unknown,
             correlations: found.correlations.into_iter().filter(is_named).collect(),
-            decisions,
+            decisions: found.decisions,
             causes,
             unnamed,
         }

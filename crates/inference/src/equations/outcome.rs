@@ -94,7 +94,8 @@ impl<R: Residuals> Search<'_, R> {
         let left = left.map(|((block, noise), given)| (block.name.clone(), [*given, power(noise)])).collect();
         let unknown = self.unknown_laws(&best);
         Found {
-            gains_differ: gains_differ(&best),
+            // What joints have a little of has their gains.
+            gains_differ: little.is_empty() && gains_differ(&best),
             causes,
             little,
             left,

@@ -86,9 +86,6 @@ impl Positions {
             index += 1;
             index * kept / all > (index - 1) * kept / all
         });
-        if windows.is_empty() {
-            return Err(InferenceError::TooShort);
-        }
         let rows: Vec<Vec<(usize, usize)>> =
             (0..log.joints.len()).map(|joint| compared_rows(&log, joint, &windows)).collect();
         let block = |(channels, rows): (&crate::joint_log::JointChannels, &Vec<(usize, usize)>)| {

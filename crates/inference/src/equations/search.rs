@@ -12,8 +12,6 @@ use super::site::{Site, least};
 pub const LEAST_GAIN: f64 = 3.0;
 /// Steps of the fit of what every joint has its own of.
 const USUAL_STEPS: usize = 8;
-/// Steps of the last fit.
-const FINAL_STEPS: usize = 8;
 /// Candidates whose fit is finished before one of them is added, where a fit is a simulation.
 const FINISHED: usize = 3;
 /// Most causes.
@@ -39,7 +37,6 @@ impl<R: Residuals> Search<'_, R> {
         }
         if self.system.is_simulated() {
             best = self.with_rivals(best, go_on)?;
-            best = self.fit(best.causes.clone(), &best.small, FINAL_STEPS, Some(&best));
         }
         best = self.without_imitations(best);
         Some(self.found(best, &given))

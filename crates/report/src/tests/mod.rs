@@ -52,6 +52,7 @@ fn nothing() -> Diagnosis {
         noise_floor: errors,
         findings: Vec::new(),
         joint_gains: BTreeMap::new(),
+        also_fitted: Vec::new(),
         confusable: Vec::new(),
         unexplained: Unexplained::default(),
         learned_residual: None,

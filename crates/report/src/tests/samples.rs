@@ -72,6 +72,7 @@ pub fn findings() -> (Diagnosis, ModelFile) {
         noise_floor: errors(0.002),
         findings: vec![friction, armature, viscous],
         joint_gains: BTreeMap::new(),
+        also_fitted: Vec::new(),
         confusable: vec![CorrelatedPair {
             effects: ["command_delay".to_owned(), "armature".to_owned()],
             correlation: -0.97,
@@ -160,6 +161,7 @@ pub fn simulated() -> (Log, Diagnosis, ModelFile) {
         baseline: RmsErrors { torque_rmse_nm: Some(0.84), q_rmse_rad: Some(0.03) },
         extended: RmsErrors { torque_rmse_nm: Some(0.07), q_rmse_rad: Some(0.003) },
         joint_gains: BTreeMap::new(),
+        also_fitted: Vec::new(),
         confusable: Vec::new(),
         unexplained: Unexplained::default(),
         ..findings().0
