@@ -48,6 +48,7 @@ mod plots;
 mod policy;
 mod policy_contract;
 mod preflight;
+mod prose;
 mod python;
 mod randomise;
 mod rapier;

@@ -35,9 +35,21 @@ fn lines<'a>(svg: &'a str, colour: &str) -> Vec<&'a str> {
 }
 
 #[test]
-fn plot_of_every_effect_has_a_visible_difference() {
+fn pages_of_the_effects_are_those_of_the_catalogue_and_every_plot_has_a_visible_difference() {
+    let folder = tempfile::tempdir().unwrap();
+    let output = twinstep(&["effects", "--pages", folder.path().to_str().unwrap()]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let names = CATALOGUE.iter().map(|effect| effect.name).chain(["index"]);
+    for page in names.map(|name| format!("{name}.md")) {
+        let [written, published] = [folder.path(), &root().join("docs/effects")].map(|folder| {
+            std::fs::read_to_string(folder.join(&page)).unwrap_or_else(|cause| panic!("{page}: {cause}"))
+        });
+        assert_eq!(written, published, "run `twinstep effects --pages docs/effects`");
+    }
     for effect in CATALOGUE {
-        let svg = plot(&["effects", effect.name]);
+        let svg = std::fs::read_to_string(folder.path().join(format!("{}.svg", effect.name))).unwrap();
+        assert!(svg.starts_with("<svg ") && svg.trim_end().ends_with("</svg>"), "{}", effect.name);
+        assert!(!svg.contains("NaN") && !svg.contains("inf"), "{}", effect.name);
         assert!(svg.contains(effect.name) && svg.contains("difference due to the effect"), "{}", effect.name);
         // The first line is the legend's sample; the others are in the three panels.
         let (without, with) = (lines(&svg, "#262626"), lines(&svg, "#F2A71B"));

@@ -4,11 +4,11 @@ use twinstep_envs::{GaitConfig, GaitTask, TaskEnv, Walk, WalkConfig};
 use twinstep_excite::{
     CommandRanges, CommandSequence, Limits, Trial, TrialError, gait_env, random_within_limits, simulate, walking_env,
 };
+use twinstep_measures::check_spec;
 use twinstep_model::{RobotModel, VecEnv};
 use twinstep_policy::Policy;
 use twinstep_sim::{BatchBackend, SimConfig};
 
-use crate::evaluate_policy::check_spec;
 use crate::exit::{Failure, input};
 
 /// Simulated robots of a policy's task.
@@ -32,7 +32,7 @@ impl CommandEnv {
             Self::Walk(env) => env.spec(),
             Self::Gait(env) => env.spec(),
         };
-        check_spec(policy, spec)?;
+        check_spec(policy, spec).map_err(input)?;
         Ok(env)
     }
 

@@ -1,13 +1,13 @@
 //! `twinstep effects`: lists and explains the effects of the catalogue.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-use twinstep_effects::{CATALOGUE, Composition, Effect, Target};
+use twinstep_effects::{CATALOGUE, Effect};
 
 use twinstep_identify::named;
-use twinstep_report::effect_plot;
+use twinstep_report::{effect_page, effect_plot};
 
-use crate::exit::{CommandResult, input};
+use crate::exit::{CommandResult, Failure, input};
 
 /// List the effects in which real robots differ from the ideal model, or explain one of them.
 ///
@@ -24,10 +24,16 @@ pub struct Args {
     /// of its prior range, the difference, and the law in quantities that a log contains.
     #[arg(long, value_name = "FILE.svg", requires = "name")]
     plot: Option<PathBuf>,
+    /// Write a page with its plot for every effect, and a list of them: index.md. docs/effects is made so.
+    #[arg(long, value_name = "DIR", conflicts_with = "name")]
+    pages: Option<PathBuf>,
 }
 
-/// Prints the catalogue, or the page of one effect.
+/// Prints the catalogue, or the page of one effect, or writes all pages.
 pub fn run(args: &Args) -> CommandResult {
+    if let Some(folder) = &args.pages {
+        return write_pages(folder);
+    }
     match &args.name {
         None => {
             for effect in CATALOGUE {
@@ -46,25 +52,27 @@ pub fn run(args: &Args) -> CommandResult {
     Ok(())
 }
 
+/// Writes the page and the plot of every effect, and the list of them.
+fn write_pages(folder: &Path) -> CommandResult {
+    std::fs::create_dir_all(folder).map_err(|cause| {
+        Failure::Input(miette::miette!("`--pages` = {}: cannot create the folder: {cause}", folder.display()))
+    })?;
+    let write = |name: String, text: String| twinstep_files::write(&folder.join(name), text).map_err(input);
+    for effect in CATALOGUE {
+        eprintln!("{}", effect.name);
+        effect_plot::write_svg(effect, &folder.join(format!("{}.svg", effect.name))).map_err(input)?;
+        write(format!("{}.md", effect.name), effect_page::page(effect))?;
+    }
+    write("index.md".to_owned(), effect_page::index())
+}
+
 /// Returns the page of an effect.
 fn text(effect: &Effect) -> String {
     let mut lines = vec![format!("{}: {}", effect.name, effect.summary), String::new()];
     lines.push(format!("  law        {}", effect.equation));
     lines.push(format!("  acts at    {}", effect.chain_stage));
-    let scopes = match effect.target {
-        Target::Joints => "all, hip, thigh, calf, FL, FR, RL, RR, left, right, or a joint such as FL_hip",
-        Target::Supply => "all",
-        Target::Bodies => "base, or a joint for its child link",
-        Target::Imu => "base",
-        Target::Ground => "ground",
-    };
-    lines.push(format!("  scopes     {scopes}"));
-    let composition = match effect.composition {
-        Composition::Add => "values of overlapping entries add up",
-        Composition::Multiply => "values of overlapping entries multiply",
-        Composition::Replace => "the entry with the narrowest scope applies; among equal scopes, the last",
-    };
-    lines.push(format!("  compose    {composition}"));
+    lines.push(format!("  scopes     {}", effect.target.scopes()));
+    lines.push(format!("  compose    {}", effect.composition.rule()));
     lines.push(format!("  signature  {}", effect.signature));
     lines.push("\nparameters".to_owned());
     for parameter in effect.parameters {

@@ -22,12 +22,14 @@ use crate::robot_file::analytic_model;
 /// Limits of a run unless others are given.
 pub const DEFAULT_LIMITS: Limits = Limits { room_m: 3.0, max_saturated: 0.05, max_rms_torque_nm: 15.0 };
 
-/// Choose velocity commands with which the log of a run tells most about unknown parameters (SPI-Active).
+/// Choose velocity commands with which the log of a run tells most about unknown parameters
+/// (SPI-Active).
 ///
-/// A policy of `walk` or `gait` follows candidate commands in the batch engine, on the robot of the model file: velocities,
-/// and with `gait` also step frequencies and the four gaits. Each run gives the Fisher information of its log about the
-/// parameters of --unknowns, in units of sensor noise and prior. CMA-ES searches for the commands with the largest
-/// criterion among those that keep the limits:
+/// A policy of `walk` or `gait` follows candidate commands in the batch engine, on the robot of the
+/// model file: velocities, and with `gait` also step frequencies and the four gaits. Each run gives
+/// the Fisher information of its log about the parameters of --unknowns, in units of sensor noise
+/// and prior. CMA-ES searches for the commands with the largest criterion among those that keep the
+/// limits:
 ///
 ///   trace       sum over the parameters, as if the others were known (SPI-Active)
 ///   d-optimal   expected gain in information; what cannot be separated counts once
@@ -35,13 +37,15 @@ pub const DEFAULT_LIMITS: Limits = Limits { room_m: 3.0, max_saturated: 0.05, ma
 ///   qoed        expected gain in information about the effects of --of-interest, after the others were eliminated;
 ///               without a list, about what random commands identify
 ///
-/// DIR receives commands.csv, for `twinstep run --commands`, and design.json. Ctrl-C ends the search and writes the
-/// best commands so far.
+/// DIR receives commands.csv, for `twinstep run --commands`, and design.json. Ctrl-C ends the
+/// search and writes the best commands so far.
 ///
-/// Example: `twinstep excite data/policies/walk.safetensors --unknowns payload@base,coulomb_friction@calf --out design`,
-/// `twinstep run data/policies/walk.safetensors --commands design/commands.csv --log log`, and
-/// `twinstep identify log --effects payload@base,coulomb_friction@calf`
+/// Example: `twinstep excite data/policies/walk.safetensors --unknowns
+/// payload@base,coulomb_friction@calf --out design`, `twinstep run data/policies/walk.safetensors
+/// --commands design/commands.csv --log log`, and `twinstep identify log --effects
+/// payload@base,coulomb_friction@calf`
 #[derive(Clone, clap::Args)]
+#[command(verbatim_doc_comment)]
 pub struct Args {
     /// Policy file of the task `walk` or `gait` (safetensors).
     pub policy: PathBuf,

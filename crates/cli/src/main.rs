@@ -8,18 +8,14 @@ mod demo;
 mod diagnose;
 mod effects;
 mod evaluate;
-mod evaluate_attitude;
-mod evaluate_gait;
-mod evaluate_jump;
 mod evaluate_policy;
-mod evaluate_pose;
-mod evaluate_tracking;
 mod excite;
 mod exit;
 mod fake_process;
 mod fake_robot;
 mod fit;
 mod frame_feed;
+mod help;
 mod hunt;
 mod identify;
 mod identify_tree;
@@ -30,6 +26,7 @@ mod line_printer;
 mod list;
 mod log;
 mod log_writer;
+mod measure_tables;
 mod mjcf;
 mod onboard_policy;
 mod open_log;
@@ -73,7 +70,7 @@ mod watchdog;
 mod web_view;
 mod write_only_backend;
 
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 use twinstep_simd::InstructionSet;
 
 /// Simulate thousands of Unitree Go2 robots for reinforcement learning, and measure the gap to the real robot.
@@ -116,7 +113,8 @@ enum CliCommand {
 }
 
 fn main() -> std::process::ExitCode {
-    let command = Cli::parse().command;
+    let matches = help::grouped(Cli::command()).get_matches();
+    let command = Cli::from_arg_matches(&matches).unwrap_or_else(|error| error.exit()).command;
     if let CliCommand::Watchdog(args) = &command {
         return exit::code(watchdog::run(args));
     }

@@ -9,7 +9,8 @@ use crate::{excite, identify, run};
 
 /// Identify a robot with the two stages of SPI-Active: ordinary commands first, then designed ones.
 ///
-/// The policy walks the robot at the endpoint, simulated or real. The folder of CONFIG, without its extension, receives:
+/// The policy walks the robot at the endpoint, simulated or real. The folder of CONFIG, without its
+/// extension, receives:
 ///
 ///   1-random    random velocity commands, their log, and the model that is identified from it
 ///   2-active    commands designed with that model, their log, and the model that is identified from both logs,
@@ -18,9 +19,9 @@ use crate::{excite, identify, run};
 ///   held-out    random commands whose log is not used for identification: the models are compared on it
 ///   report.md   parameters with intervals, errors on the held-out log, robot time and falls
 ///
-/// The same command continues after Ctrl-C or a crash: what a stage has completed is kept, and a log that was interrupted
-/// is recorded again. The robot walks without a question as soon as a stage needs a log, `room_m` around where it then
-/// stands.
+/// The same command continues after Ctrl-C or a crash: what a stage has completed is kept, and a
+/// log that was interrupted is recorded again. The robot walks without a question as soon as a
+/// stage needs a log, `room_m` around where it then stands.
 ///
 /// CONFIG (TOML); `policy` and `unknowns` are required, the others have these defaults:
 ///
@@ -39,8 +40,10 @@ use crate::{excite, identify, run};
 ///   robot, zenoh              as of `twinstep run`; without a default
 ///   model                     model file to start from; default: the ideal Go2
 ///
-/// Example: `twinstep serve --envs 1 --model hidden.toml` and, in another terminal, `twinstep spi-active spi.toml`
+/// Example: `twinstep serve --envs 1 --model hidden.toml` and, in another terminal, `twinstep
+/// spi-active spi.toml`
 #[derive(clap::Args)]
+#[command(verbatim_doc_comment)]
 #[allow(clippy::doc_link_with_quotes, reason = "it is TOML")]
 pub struct Args {
     /// Config file (TOML).

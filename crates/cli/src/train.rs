@@ -5,7 +5,8 @@ use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 use twinstep_envs::TaskConfig;
-use twinstep_learning::{Checkpoint, EvaluationError, Learner, LearningError, PpoConfig, Trainer};
+use twinstep_learning::{Checkpoint, Learner, LearningError, PpoConfig, Trainer};
+use twinstep_measures::MeasureError;
 use twinstep_model::EnvSpec;
 use twinstep_policy::{Collector, CurvePoint, Mlp, Policy, PolicyOrigin, StepCollector, with_residual};
 use twinstep_viewer::LearningPoint;
@@ -24,25 +25,28 @@ const SAVE_EVERY: Duration = Duration::from_secs(10);
 
 /// Train a policy by proximal policy optimisation.
 ///
-/// Simulates the robots on all cores, or runs the policy on the robots of servers (--endpoint), and learns from the
-/// trajectories. The folder then contains:
+/// Simulates the robots on all cores, or runs the policy on the robots of servers (--endpoint), and
+/// learns from the trajectories. The folder then contains:
 ///
 ///   policy.safetensors     the policy, with the spec of its environment
-///   policy.onnx            the same for other runtimes: input `obs` [batch, N] in SI units, output `action` [batch, joints]
-///   evaluation.json        velocity errors and falls of 256 fresh robots; task `jump`: where they land; `attitude` and `pose`: errors
+///   policy.onnx            the same for other runtimes: input `obs` [batch, N], output `action`
+///   evaluation.json        errors and falls of 256 fresh robots
 ///   config.toml            all settings; --config config.toml repeats the training
-///   progress.csv           errors, falls, reward terms and times of every update; TensorBoard reads events.out.*
+///   progress.csv           errors, falls, rewards and times of every update, also for TensorBoard
 ///   curve.svg              learning curve
-///   checkpoint.safetensors state of the training, saved every 10 s; the one before is checkpoint.previous.safetensors
+///   checkpoint.safetensors state of the training, saved every 10 s; before it checkpoint.previous.*
 ///   exploration.*          task `explore`: base policy and residual as one policy of `walk`
 ///
-/// Ctrl-C saves the training and ends it; --resume continues it. Equal seeds and settings give equal policies.
+/// Ctrl-C saves the training and ends it; --resume continues it. Equal seeds and settings give
+/// equal policies.
 ///
 /// Examples: `twinstep train walk --out walk --seed 1`, or on the robot that a diagnosis found:
-/// `twinstep train walk --out walk --model diagnosis/extended.toml --randomise-effects`, or from an earlier training:
-/// `twinstep train walk --out tuned --from walk/checkpoint.safetensors --model extended.toml --steps 5000000`, or any robot:
-/// `twinstep train pose --out arm --model arm.toml --steps 1000000`
+/// `twinstep train walk --out walk --model diagnosis/extended.toml --randomise-effects`, or from an
+/// earlier training: `twinstep train walk --out tuned --from walk/checkpoint.safetensors --model
+/// extended.toml --steps 5000000`, or any robot: `twinstep train pose --out arm --model arm.toml
+/// --steps 1000000`
 #[derive(clap::Args)]
+#[command(verbatim_doc_comment)]
 pub struct Args {
     /// Task to learn. Default: that of the config file, else walk.
     #[arg(value_parser = ["walk", "track", "jump", "gait", "attitude", "explore", "pose"])]
@@ -482,7 +486,7 @@ fn earlier_networks(path: &Path, spec: &EnvSpec, config: &PpoConfig, seed: u64) 
 }
 
 fn other_spec(earlier: &EnvSpec, spec: &EnvSpec) -> Failure {
-    input(EvaluationError::OtherSpec { policy: earlier.hash(), env: spec.hash() })
+    input(MeasureError::OtherSpec { policy: earlier.hash(), env: spec.hash() })
 }
 
 fn progress_text(point: &CurvePoint) -> String {

@@ -1,22 +1,22 @@
 //! Evaluation of a policy at the end of its training.
 
 use twinstep_envs::{JumpConfig, TaskConfig};
-use twinstep_learning::{Evaluation, EvaluationError, EvaluationPlan, evaluate};
+use twinstep_measures::{
+    AttitudeErrors, AttitudeFollowing, Evaluation, JUMP_S, Jumping, Landings, Measure, MeasureError, PoseErrors,
+    PoseFollowing, Run, Walking, measure,
+};
+use twinstep_model::{EnvSpec, VecEnv};
 use twinstep_policy::Policy;
 use twinstep_sim::{Engine, SimConfig};
 
-use crate::evaluate_attitude::{self, AttitudeErrors, AttitudeRow};
-use crate::evaluate_jump::{self, JumpRow};
-use crate::evaluate_policy::check_spec;
-use crate::evaluate_pose::{self, PoseErrors};
 use crate::exit::{Failure, Signals, other};
+use crate::measure_tables::{self, ByTarget, Row};
 use crate::train_config::TrainConfig;
 use crate::train_endpoints::remote_env;
 
 /// Robots, simulated time [s] and seed of the evaluation.
 const ROBOTS: usize = 256;
-const SECONDS: f64 = 20.0;
-const SEED: u64 = 1_000_000;
+const RUN: Run = Run { seconds: 20.0, seed: 1_000_000 };
 
 /// Evaluates `policy`, which was trained with `config` on the robots of these servers, or in this process if there are
 /// none. Returns the evaluation as JSON and as a table.
@@ -36,23 +36,53 @@ pub fn evaluate_policy(
     };
     if let TaskConfig::Jump(task) = &config.task {
         let targets = jumps(policy, config, task, signals)?;
-        let rows = [JumpRow { condition: "nominal", engine: Engine::Batch, targets }];
-        let table = evaluate_jump::table(ROBOTS as u32, &rows);
-        return Ok((json(serde_json::to_string_pretty(&rows[0].targets)), text(table)));
+        let rows = [nominal(ByTarget { targets })];
+        let table = measure_tables::jumps(ROBOTS as u32, &rows);
+        return Ok((json(serde_json::to_string_pretty(&rows[0].found.targets)), text(table)));
     }
     if let TaskConfig::Attitude(_) = &config.task {
         let errors = attitude(policy, config, signals)?;
-        let rows = [AttitudeRow { condition: "nominal", engine: Engine::Batch, errors }];
-        let table = evaluate_attitude::table(ROBOTS as u32, SECONDS, &rows);
-        return Ok((json(serde_json::to_string_pretty(&rows[0].errors)), text(table)));
+        let rows = [nominal(errors)];
+        let table = measure_tables::attitude(ROBOTS as u32, RUN.seconds, &rows);
+        return Ok((json(serde_json::to_string_pretty(&rows[0].found)), text(table)));
     }
     if let TaskConfig::Pose(_) = &config.task {
         let errors = pose(policy, config, signals)?;
-        let table = evaluate_pose::table(ROBOTS, SECONDS, &errors);
+        let table = measure_tables::pose(ROBOTS, RUN.seconds, &errors);
         return Ok((json(serde_json::to_string_pretty(&errors)), text(table)));
     }
     let evaluation = walking(policy, config, endpoints, signals)?;
     Ok((json(serde_json::to_string_pretty(&evaluation)), evaluation_text(&evaluation)))
+}
+
+/// Returns a row of the nominal robot.
+fn nominal<T>(found: T) -> Row<T> {
+    Row { condition: "nominal", engine: Engine::Batch, found }
+}
+
+/// Measures what the policy does on fresh robots of this process.
+fn measured<M: Measure>(
+    policy: &Policy,
+    config: &TrainConfig,
+    run: Run,
+    signals: &Signals,
+    new: impl Fn(&EnvSpec, usize) -> Result<M, MeasureError>,
+) -> Result<M::Found, Failure> {
+    measured_on(policy, config.envs(ROBOTS, 1, 0)?.remove(0).as_mut(), run, signals, new)
+}
+
+fn measured_on<M: Measure>(
+    policy: &Policy,
+    env: &mut dyn VecEnv,
+    run: Run,
+    signals: &Signals,
+    new: impl Fn(&EnvSpec, usize) -> Result<M, MeasureError>,
+) -> Result<M::Found, Failure> {
+    let new = new(env.spec(), env.num_envs()).map_err(other)?;
+    measure(policy, env, new, run, |_| signals.check().is_ok()).map_err(|error| match error {
+        MeasureError::Stopped => Failure::Interrupted,
+        _ => other(error),
+    })
 }
 
 fn walking(
@@ -63,18 +93,12 @@ fn walking(
 ) -> Result<Evaluation, Failure> {
     let fresh = fresh(config, config.task.with_default_settings());
     let robot = fresh.robots(1)?.control();
-    let plan = EvaluationPlan { feet: &robot.feet, torque_limits: &robot.torque_limits, seconds: SECONDS, seed: SEED };
-    let proceed = |_: f64| signals.check().is_ok();
-    let failure = |error| match error {
-        EvaluationError::Stopped => Failure::Interrupted,
-        _ => other(error),
-    };
+    let new = |spec: &EnvSpec, robots| Walking::new(spec, robots, &robot.feet, &robot.torque_limits);
     if endpoints.is_empty() {
-        let mut env = fresh.envs(ROBOTS, 1, 0)?.remove(0);
-        return evaluate(policy, env.as_mut(), plan, proceed).map_err(failure);
+        return measured(policy, &fresh, RUN, signals, new);
     }
     let mut env = remote_env(endpoints, ROBOTS)?;
-    let evaluation = evaluate(policy, &mut env, plan, proceed).map_err(failure)?;
+    let evaluation = measured_on(policy, &mut env, RUN, signals, new)?;
     env.close().map_err(other)?;
     Ok(evaluation)
 }
@@ -84,32 +108,24 @@ fn jumps(
     config: &TrainConfig,
     trained: &JumpConfig,
     signals: &Signals,
-) -> Result<Vec<evaluate_jump::Landings>, Failure> {
-    let mut targets = Vec::new();
-    for task in evaluate_jump::tasks(trained) {
+) -> Result<Vec<Landings>, Failure> {
+    let to_target = |task: JumpConfig| {
         let fresh = fresh(config, TaskConfig::Jump(task.clone()));
-        let mut env = fresh.envs(ROBOTS, 1, 0)?.remove(0);
-        let proceed = |_: f64| signals.check().is_ok();
-        check_spec(policy, env.spec())?;
-        let landings = evaluate_jump::evaluate(policy, env.as_mut(), &fresh.quadruped()?, &task, SEED, proceed);
-        targets.push(landings.map_err(other)?.ok_or(Failure::Interrupted)?);
-    }
-    Ok(targets)
+        let robot = fresh.quadruped()?;
+        let new = |spec: &EnvSpec, robots| Ok(Jumping::new(spec, robots, &robot, &task));
+        measured(policy, &fresh, Run { seconds: JUMP_S, ..RUN }, signals, new)
+    };
+    Jumping::tasks(trained).into_iter().map(to_target).collect()
 }
 
 fn attitude(policy: &Policy, config: &TrainConfig, signals: &Signals) -> Result<AttitudeErrors, Failure> {
-    let mut env = fresh(config, TaskConfig::Attitude(evaluate_attitude::task())).envs(ROBOTS, 1, 0)?.remove(0);
-    check_spec(policy, env.spec())?;
-    let proceed = |_: f64| signals.check().is_ok();
-    let errors = evaluate_attitude::evaluate(policy, env.as_mut(), (SECONDS, SEED), proceed);
-    errors.map_err(other)?.ok_or(Failure::Interrupted)
+    let fresh = fresh(config, TaskConfig::Attitude(AttitudeFollowing::task()));
+    measured(policy, &fresh, RUN, signals, |spec, _| AttitudeFollowing::new(spec))
 }
 
 fn pose(policy: &Policy, config: &TrainConfig, signals: &Signals) -> Result<PoseErrors, Failure> {
-    let mut env = fresh(config, config.task.with_default_settings()).envs(ROBOTS, 1, 0)?.remove(0);
-    check_spec(policy, env.spec())?;
-    let proceed = |_: f64| signals.check().is_ok();
-    evaluate_pose::evaluate(policy, env.as_mut(), (SECONDS, SEED), proceed).map_err(other)?.ok_or(Failure::Interrupted)
+    let fresh = fresh(config, config.task.with_default_settings());
+    measured(policy, &fresh, RUN, signals, |spec, _| PoseFollowing::new(spec))
 }
 
 /// Returns the training's robot with default physics.

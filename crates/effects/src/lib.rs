@@ -142,6 +142,30 @@ pub enum Target {
     Ground,
 }
 
+impl Composition {
+    /// Returns the rule in a sentence.
+    pub fn rule(self) -> &'static str {
+        match self {
+            Self::Add => "values of overlapping entries add up",
+            Self::Multiply => "values of overlapping entries multiply",
+            Self::Replace => "the entry with the narrowest scope applies; among equal scopes, the last",
+        }
+    }
+}
+
+impl Target {
+    /// Returns the scopes as in a model file, in words.
+    pub fn scopes(self) -> &'static str {
+        match self {
+            Self::Joints => "all, hip, thigh, calf, FL, FR, RL, RR, left, right, or a joint such as FL_hip",
+            Self::Supply => "all",
+            Self::Bodies => "base, or a joint for its child link",
+            Self::Imu => "base",
+            Self::Ground => "ground",
+        }
+    }
+}
+
 /// Site at which an effect is applied.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum EffectSite {

@@ -5,14 +5,12 @@
 //! - [`PpoConfig`]: the settings, the `[train]` table of a config file.
 //! - [`gae`]: the advantages; `update`: the gradient of the loss; [`Mirror`]: left and right exchanged.
 //! - [`Checkpoint`]: state of a training in a file; [`EventFile`]: scalars for TensorBoard.
-//! - [`evaluate`]: velocity errors, falls, gait and power of a walking policy; `walking` has their sums.
 //!
 //! Equal seeds, settings and environments give equal bits on any number of threads.
 
 mod adam;
 mod checkpoint;
 mod config;
-mod evaluation;
 pub mod gae;
 mod rollout;
 mod statistics;
@@ -20,18 +18,15 @@ mod symmetry;
 mod tensorboard;
 mod trainer;
 mod update;
-mod walking;
 
 pub use adam::Adam;
 pub use checkpoint::Checkpoint;
 pub use config::{PpoConfig, PpoConfigError};
-pub use evaluation::{EvaluationError, EvaluationPlan, evaluate};
 pub use rollout::Group;
 pub use statistics::{Statistics, VelocityLayout};
 pub use symmetry::{Mirror, NoMirror};
 pub use tensorboard::EventFile;
 pub use trainer::{Iteration, Learner, LearningError, Trainer};
-pub use walking::{Evaluation, SpeedBin};
 
 #[cfg(test)]
 mod tests;

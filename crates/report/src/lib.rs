@@ -3,9 +3,11 @@
 //! - [`write_report`]: the HTML page of a diagnosis, from [`ReportData`].
 //! - [`chart`]: panels with axes and lines, in one style.
 //! - [`joint_plot`], [`evaluation_plot`], [`effect_plot`]: the plots of `demo`, `evaluate` and `effects`.
+//! - [`effect_page`]: the page of an effect.
 //! - [`joint_table()`]: the position error of each joint as text.
 
 pub mod chart;
+pub mod effect_page;
 pub mod effect_plot;
 pub mod evaluation_plot;
 mod film_strip;

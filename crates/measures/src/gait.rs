@@ -1,12 +1,12 @@
-//! Evaluation of a policy of the task `gait`: step frequency, phases of the feet, velocity errors and falls of each gait.
+//! Step frequency, phases of the feet and velocity errors of each gait, of a policy of the task `gait`.
 
 use std::f64::consts::TAU;
-use std::fmt::Write;
 
 use serde::Serialize;
 use twinstep_envs::{Gait, GaitConfig, WalkConfig};
-use twinstep_model::{EnvError, EnvSpec, ResetRequest, SpecField, VecEnv};
-use twinstep_policy::{Policy, PolicyRunner};
+use twinstep_model::{EnvError, EnvSpec, SpecField};
+
+use crate::{Measure, MeasureError, Step, share_up};
 
 /// Normal force above which a foot is on the ground [N].
 const CONTACT_FORCE: f32 = 1.0;
@@ -18,20 +18,6 @@ const TRANSIENT_S: f64 = 1.0;
 const MAX_FREQUENCY_ERROR: f64 = 0.05;
 /// Error of each phase up to which a gait is followed [cycles].
 const MAX_PHASE_ERROR: f64 = 0.1;
-/// Conditions under which gaits are evaluated.
-pub const CONDITIONS: [&str; 4] = ["nominal", "robots", "pushes", "delay"];
-
-/// Gaits under a condition.
-#[derive(Serialize)]
-pub struct GaitRow {
-    /// Conditions of the robots.
-    pub condition: &'static str,
-    /// Physics engine.
-    pub engine: twinstep_sim::Engine,
-    /// Measured motion by gait.
-    pub gaits: Vec<GaitMotion>,
-}
-
 /// Measured motion of robots that were commanded one gait.
 #[derive(Debug, Serialize)]
 pub struct GaitMotion {
@@ -53,54 +39,54 @@ pub struct GaitMotion {
     pub yaw_rate_rms: f64,
 }
 
-/// Returns the settings of the task for each gait. Episodes end by falls only.
-pub fn tasks() -> [(GaitConfig, Gait); 4] {
-    Gait::ALL.map(|gait| {
-        let default = GaitConfig::default();
-        let walk = WalkConfig { max_episode_s: 1e6, ..default.walk };
-        (GaitConfig { gaits: vec![gait], walk, ..default }, gait)
-    })
+/// Measures how robots follow one gait.
+///
+/// Contacts are those of the simulator, so that the measurement does not depend on the contact schedule of the task.
+pub struct GaitFollowing {
+    gait: Gait,
+    layout: Layout,
+    walkers: Vec<Walker>,
+    sums: Sums,
 }
 
-/// Steps all robots of `env` for `seconds` with the mean action of `policy`, and measures how they follow their gait.
-///
-/// Contacts are those of the simulator, so that the measurement does not depend on the contact schedule of the task. A
-/// robot counts until it falls. `proceed` is called after each step; the evaluation stops if it returns false.
-pub fn evaluate(
-    policy: &Policy,
-    env: &mut dyn VecEnv,
-    gait: Gait,
-    (seconds, seed): (f64, u64),
-    mut proceed: impl FnMut(f64) -> bool,
-) -> Result<Option<GaitMotion>, EnvError> {
-    let layout = Layout::new(env.spec());
-    let num_envs = env.num_envs();
-    let mut runner = PolicyRunner::new(policy);
-    let mut obs = env.reset(&ResetRequest::seeded(seed, num_envs))?.to_vec();
-    let mut actions = vec![0.0; num_envs * env.spec().action_len()];
-    let (mut walkers, mut sums) = (vec![Walker::default(); num_envs], Sums::default());
-    let steps = (seconds / layout.policy_dt).round() as usize;
-    for step in 0..steps {
-        runner.run(&obs, &mut actions);
-        let batch = env.step(&actions)?;
-        for (robot, walker) in walkers.iter_mut().enumerate() {
-            walker.has_fallen |= batch.done(robot);
-            if !walker.has_fallen {
-                let command = &obs[robot * layout.obs_len..][..layout.obs_len];
-                let truth = &batch.critic_obs[robot * layout.critic_len..][..layout.critic_len];
-                walker.add(&layout, (command, truth), step, &mut sums);
-            }
-        }
-        obs.copy_from_slice(&batch.obs);
-        if !proceed((step + 1) as f64 / steps as f64) {
-            return Ok(None);
-        }
+impl GaitFollowing {
+    /// Names of the conditions under which gaits are evaluated.
+    pub const CONDITIONS: [&str; 4] = ["nominal", "robots", "pushes", "delay"];
+
+    /// Returns the settings of the task for each gait. Episodes end by falls only.
+    pub fn tasks() -> [(GaitConfig, Gait); 4] {
+        Gait::ALL.map(|gait| {
+            let default = GaitConfig::default();
+            let walk = WalkConfig { max_episode_s: 1e6, ..default.walk };
+            (GaitConfig { gaits: vec![gait], walk, ..default }, gait)
+        })
     }
-    for walker in &mut walkers {
-        walker.end_command(&layout, &mut sums);
+
+    /// Prepares the measure of environments of the task `gait`.
+    pub fn new(spec: &EnvSpec, num_envs: usize, gait: Gait) -> Result<Self, MeasureError> {
+        let layout = Layout::new(spec)?;
+        Ok(Self { gait, layout, walkers: vec![Walker::default(); num_envs], sums: Sums::default() })
     }
-    let up = walkers.iter().filter(|walker| !walker.has_fallen).count() as f64 / num_envs as f64;
-    Ok(Some(sums.motion(gait, up)))
+}
+
+impl Measure for GaitFollowing {
+    type Found = GaitMotion;
+
+    fn add(&mut self, step: &mut Step<'_>) -> Result<(), EnvError> {
+        for robot in step.robots() {
+            let command = &step.before[robot * self.layout.obs_len..][..self.layout.obs_len];
+            let truth = &step.batch.critic_obs[robot * self.layout.critic_len..][..self.layout.critic_len];
+            self.walkers[robot].add(&self.layout, (command, truth), step.index, &mut self.sums);
+        }
+        Ok(())
+    }
+
+    fn found(mut self, has_fallen: &[bool]) -> GaitMotion {
+        for (walker, _) in self.walkers.iter_mut().zip(has_fallen).filter(|(_, has_fallen)| !**has_fallen) {
+            walker.end_command(&self.layout, &mut self.sums);
+        }
+        self.sums.motion(self.gait, share_up(has_fallen))
+    }
 }
 
 /// Positions of the quantities in the observations.
@@ -118,27 +104,28 @@ struct Layout {
 
 impl Layout {
     /// Returns the layout of the task `gait` on a simulated robot.
-    fn new(spec: &EnvSpec) -> Self {
-        let index = |field: Option<(usize, &SpecField)>| field.expect("the task `gait` has it").0;
-        let (policy, critic) = (|name| index(spec.observation_field(name)), |name| index(spec.critic_field(name)));
-        Self {
+    fn new(spec: &EnvSpec) -> Result<Self, MeasureError> {
+        let start =
+            |field: Option<(usize, &SpecField)>, name| field.map(|(start, _)| start).ok_or(MeasureError::Missing(name));
+        let (policy, critic) =
+            (|name| start(spec.observation_field(name), name), |name| start(spec.critic_field(name), name));
+        Ok(Self {
             obs_len: spec.obs_len(),
             critic_len: spec.critic_obs_len(),
             policy_dt: spec.policy_dt,
-            velocity_command: policy("velocity_command"),
-            step_frequency: policy("step_frequency"),
-            phase_offset: policy("phase_offset"),
-            linear_velocity: critic("true_linear_velocity"),
-            angular_velocity: critic("true_angular_velocity"),
-            foot_force: critic("foot_force"),
-        }
+            velocity_command: policy("velocity_command")?,
+            step_frequency: policy("step_frequency")?,
+            phase_offset: policy("phase_offset")?,
+            linear_velocity: critic("true_linear_velocity")?,
+            angular_velocity: critic("true_angular_velocity")?,
+            foot_force: critic("foot_force")?,
+        })
     }
 }
 
 /// One robot under its current command.
 #[derive(Clone, Debug, Default)]
 struct Walker {
-    has_fallen: bool,
     /// Step frequency [Hz] and phase offsets [cycles] of the command.
     command: [f32; 4],
     /// Step in which the command began.
@@ -184,7 +171,7 @@ impl Walker {
         let last = touchdowns.iter().filter_map(|steps| steps.last()).max().copied().unwrap_or_default();
         let seconds = last.saturating_sub(self.since) as f64 * layout.policy_dt - TRANSIENT_S;
         // Without some cycles there is nothing to measure.
-        if frequency == 0.0 || self.has_fallen || seconds * frequency < 3.0 {
+        if frequency == 0.0 || seconds * frequency < 3.0 {
             return;
         }
         let frequency_error = (0..4).map(|leg| (measured_frequency(&touchdowns[leg], layout) / frequency - 1.0).abs());
@@ -259,33 +246,6 @@ impl Sums {
     }
 }
 
-/// Returns the measurements as a table.
-pub fn table(robots: u32, seconds: f64, rows: &[GaitRow]) -> String {
-    let mut text = format!(
-        "{robots} robots, {seconds} s, new command every 5 s. Followed: share of the commands with a step frequency within \
-         5 % and each\nphase within 0.1 cycles, from 1 s after the command. Errors of velocity: RMS, all of the time\n\n\
-         condition  engine   gait   up       followed  frequency  phase         duty  velocity   yaw rate\n"
-    );
-    for GaitRow { condition, engine, gaits } in rows {
-        let engine = format!("{engine:?}").to_lowercase();
-        for motion in gaits {
-            let _ = writeln!(
-                text,
-                "{condition:10} {engine:8} {:6} {:5.1} %  {:5.1} %   {:5.1} %    {:.3} cycles  {:.2}  {:.3} m/s  {:.3} rad/s",
-                motion.gait,
-                100.0 * motion.up,
-                100.0 * motion.followed,
-                100.0 * motion.frequency_error,
-                motion.phase_error,
-                motion.duty_factor,
-                motion.velocity_rms,
-                motion.yaw_rate_rms,
-            );
-        }
-    }
-    text
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -304,7 +264,7 @@ mod tests {
     #[test]
     fn a_trot_is_followed_as_a_trot_and_not_as_a_pace() {
         let spec = twinstep_envs::GaitTask::new(GaitConfig::default(), &twinstep_model::go2(), true).expect("valid");
-        let layout = Layout::new(twinstep_envs::Task::spec(&spec));
+        let layout = Layout::new(twinstep_envs::Task::spec(&spec)).expect("the spec of the task");
         let measure = |offsets: [f32; 3]| {
             let (mut walker, mut sums) = (Walker::default(), Sums::default());
             for step in 0..200 {

@@ -1,14 +1,12 @@
-//! Evaluation of a policy of the task `jump`: where the robots land.
-
-use std::fmt::Write;
+//! Where robots land, of a policy of the task `jump`.
 
 use glam::{Quat, Vec3};
 use serde::Serialize;
 use twinstep_envs::{GroundPose, JumpConfig, WalkConfig};
-use twinstep_model::{EnvError, PerLeg, ResetRequest, RobotModel, Scene, VecEnv};
-use twinstep_policy::{Policy, PolicyRunner};
+use twinstep_model::{EnvError, EnvSpec, PerLeg, RobotModel, Scene};
 
-use crate::evaluate_tracking::ground_pose;
+use crate::tracking::ground_pose;
+use crate::{Measure, Step, share_up};
 
 /// Simulated time of a jump with the recovery after it [s].
 pub const JUMP_S: f64 = 3.0;
@@ -20,17 +18,6 @@ const MIN_AIR_TIME: f64 = 0.06;
 const GRAVITY: f32 = 9.81;
 /// Distance from the target within which a landing is a success [m].
 const SUCCESS_DISTANCE: f64 = 0.05;
-
-/// Landings under a condition.
-#[derive(Serialize)]
-pub struct JumpRow {
-    /// Conditions of the robots.
-    pub condition: &'static str,
-    /// Physics engine.
-    pub engine: twinstep_sim::Engine,
-    /// Landings by target.
-    pub targets: Vec<Landings>,
-}
 
 /// Landings of all robots for one target.
 #[derive(Debug, Serialize)]
@@ -59,67 +46,63 @@ pub struct Landings {
     pub clearance: f64,
 }
 
-/// Returns the settings of the task at both ends and in the middle of the ranges of its targets, once if all are one target.
-/// Episodes end by falls only.
-pub fn tasks(trained: &JumpConfig) -> Vec<JumpConfig> {
-    let at = |share: f32| {
-        let point = |[low, high]: [f32; 2]| [low + share * (high - low); 2];
-        JumpConfig {
-            target_x_m: point(trained.target_x_m),
-            target_y_m: point(trained.target_y_m),
-            target_yaw_rad: point(trained.target_yaw_rad),
-            phase_s: trained.phase_s,
-            walk: WalkConfig { max_episode_s: 1e6, ..JumpConfig::default().walk },
-            ..JumpConfig::default()
-        }
-    };
-    let mut tasks = [0.0, 0.5, 1.0].map(at).to_vec();
-    tasks.dedup();
-    tasks
-}
-
-/// Lets all robots of `env` jump once with the mean action of `policy`, and measures where they land.
+/// Measures one jump of each robot to one target.
 ///
 /// The landing is the pose of the base at the first contact of a foot after all feet were off the ground for at least 60
-/// ms, from the drawn poses: it is independent of the task's own. Robots start at the origin. `proceed` is called after
-/// each step; the evaluation stops if it returns false.
-pub fn evaluate(
-    policy: &Policy,
-    env: &mut dyn VecEnv,
-    robot: &RobotModel,
-    task: &JumpConfig,
-    seed: u64,
-    mut proceed: impl FnMut(f64) -> bool,
-) -> Result<Option<Landings>, EnvError> {
-    let spec = env.spec().clone();
-    let num_envs = env.num_envs();
-    let mut runner = PolicyRunner::new(policy);
-    let mut obs = env.reset(&ResetRequest::seeded(seed, num_envs))?.to_vec();
-    let mut actions = vec![0.0; num_envs * spec.action_len()];
-    let mut jumpers = vec![Jumper::default(); num_envs];
-    let steps = (JUMP_S / spec.policy_dt).round() as usize;
-    for step in 0..steps {
-        runner.run(&obs, &mut actions);
-        let batch = env.step(&actions)?;
-        for (index, jumper) in jumpers.iter_mut().enumerate() {
-            jumper.has_fallen |= batch.done(index);
-        }
-        obs.copy_from_slice(&batch.obs);
-        for (index, jumper) in jumpers.iter_mut().enumerate().filter(|(_, jumper)| !jumper.has_fallen) {
-            jumper.add(&env.scene(index)?, robot, spec.policy_dt as f32);
-        }
-        if !proceed((step + 1) as f64 / steps as f64) {
-            return Ok(None);
-        }
+/// ms, from the drawn poses: it is independent of the task's own. Robots start at the origin.
+pub struct Jumping {
+    robot: RobotModel,
+    target: [f32; 3],
+    dt: f32,
+    jumpers: Vec<Jumper>,
+}
+
+impl Jumping {
+    /// Returns the settings of the task at both ends and in the middle of the ranges of its targets, once if all are one target.
+    /// Episodes end by falls only.
+    pub fn tasks(trained: &JumpConfig) -> Vec<JumpConfig> {
+        let at = |share: f32| {
+            let point = |[low, high]: [f32; 2]| [low + share * (high - low); 2];
+            JumpConfig {
+                target_x_m: point(trained.target_x_m),
+                target_y_m: point(trained.target_y_m),
+                target_yaw_rad: point(trained.target_yaw_rad),
+                phase_s: trained.phase_s,
+                walk: WalkConfig { max_episode_s: 1e6, ..JumpConfig::default().walk },
+                ..JumpConfig::default()
+            }
+        };
+        let mut tasks = [0.0, 0.5, 1.0].map(at).to_vec();
+        tasks.dedup();
+        tasks
     }
-    let target = [task.target_x_m[0], task.target_y_m[0], task.target_yaw_rad[0]];
-    Ok(Some(landings(target, &jumpers)))
+
+    /// Prepares the measure of jumps of the task's only target.
+    pub fn new(spec: &EnvSpec, num_envs: usize, robot: &RobotModel, task: &JumpConfig) -> Self {
+        let target = [task.target_x_m[0], task.target_y_m[0], task.target_yaw_rad[0]];
+        let jumpers = vec![Jumper::default(); num_envs];
+        Self { robot: robot.clone(), target, dt: spec.policy_dt as f32, jumpers }
+    }
+}
+
+impl Measure for Jumping {
+    type Found = Landings;
+
+    fn add(&mut self, step: &mut Step<'_>) -> Result<(), EnvError> {
+        for robot in step.robots() {
+            self.jumpers[robot].add(&step.scene(robot)?, &self.robot, self.dt);
+        }
+        Ok(())
+    }
+
+    fn found(self, has_fallen: &[bool]) -> Landings {
+        landings(self.target, &self.jumpers, share_up(has_fallen))
+    }
 }
 
 /// A robot between start and landing.
 #[derive(Clone, Debug, Default)]
 struct Jumper {
-    has_fallen: bool,
     /// True once a foot has touched the ground: the drop at the start is no jump.
     has_stood: bool,
     /// The last samples without contact, the newest last; the time in the air is their number.
@@ -201,7 +184,7 @@ fn sample(scene: &Scene, robot: &RobotModel) -> Sample {
     Sample { base: ground_pose(scene), clearance }
 }
 
-fn landings(target: [f32; 3], jumpers: &[Jumper]) -> Landings {
+fn landings(target: [f32; 3], jumpers: &[Jumper], up: f64) -> Landings {
     let goal = GroundPose { x: target[0], y: target[1], yaw: target[2] };
     let landed: Vec<_> = jumpers.iter().filter_map(|jumper| jumper.landing).collect();
     let share = |count: usize| count as f64 / jumpers.len() as f64;
@@ -213,7 +196,7 @@ fn landings(target: [f32; 3], jumpers: &[Jumper]) -> Landings {
     Landings {
         target,
         landed: share(landed.len()),
-        up: share(jumpers.iter().filter(|jumper| !jumper.has_fallen).count()),
+        up,
         l_jump: mean(&|landing| (landing.pose.x - goal.x).abs()),
         mean_error: mean(&|landing| landing.pose.x - goal.x),
         distance: mean(&|landing| distance(&landing.pose)),
@@ -223,37 +206,6 @@ fn landings(target: [f32; 3], jumpers: &[Jumper]) -> Landings {
         flight_s: mean(&|landing| landing.flight_s),
         clearance: mean(&|landing| landing.clearance),
     }
-}
-
-/// Returns the landings as a table.
-pub fn table(robots: u32, rows: &[JumpRow]) -> String {
-    let mut text = format!(
-        "{robots} robots, one jump from standing, {JUMP_S} s. L_jump: mean |x_land - x_target|\n\n\
-         condition  engine   target [m, m, rad]  landed  up       L_jump    mean error  distance  yaw error  turn in flight  flight  clearance\n"
-    );
-    for JumpRow { condition, engine, targets } in rows {
-        let engine = format!("{engine:?}").to_lowercase();
-        for landings in targets {
-            let [x, y, yaw] = landings.target;
-            let _ = write!(
-                text,
-                "{condition:10} {engine:8} {x:.2}, {y:.2}, {yaw:5.2}   {:5.1} %  {:5.1} %  ",
-                100.0 * landings.landed,
-                100.0 * landings.up
-            );
-            let Landings { l_jump, mean_error, distance, yaw_error, flight_turn, flight_s, clearance, .. } = landings;
-            let _ = if landings.landed == 0.0 {
-                writeln!(text, "no robot has jumped and landed")
-            } else {
-                let cm = 100.0 * clearance;
-                writeln!(
-                    text,
-                    "{l_jump:6.3} m  {mean_error:+7.3} m   {distance:6.3} m  {yaw_error:.3} rad  {flight_turn:+.3} rad      {flight_s:.2} s  {cm:4.1} cm"
-                )
-            };
-        }
-    }
-    text
 }
 
 #[cfg(test)]
@@ -276,8 +228,9 @@ mod tests {
 
     #[test]
     fn targets_are_both_ends_and_the_middle_of_the_ranges_or_the_only_target() {
-        let yaw =
-            |target_yaw_rad| tasks(&JumpConfig { target_yaw_rad, target_x_m: [0.0, 0.0], ..JumpConfig::default() });
+        let yaw = |target_yaw_rad| {
+            Jumping::tasks(&JumpConfig { target_yaw_rad, target_x_m: [0.0, 0.0], ..JumpConfig::default() })
+        };
         let turns: Vec<f32> = yaw([-2.0, 1.0]).iter().map(|task| task.target_yaw_rad[0]).collect();
         assert_eq!(turns, [-2.0, -0.5, 1.0]);
         assert_eq!(yaw([2.356, 2.356]).len(), 1);
@@ -310,10 +263,10 @@ mod tests {
         let jumpers = [
             Jumper { landing: landing(pose), ..Jumper::default() },
             Jumper::default(),
-            Jumper { has_fallen: true, ..Jumper::default() },
+            Jumper::default(),
             Jumper { landing: landing(GroundPose { x: 0.61, ..pose }), ..Jumper::default() },
         ];
-        let landings = landings([0.6, 0.0, 0.0], &jumpers);
+        let landings = landings([0.6, 0.0, 0.0], &jumpers, share_up(&[false, false, true, false]));
         assert_eq!((landings.landed, landings.up, landings.within_5_cm), (0.5, 0.75, 0.25));
         assert!((landings.l_jump - 0.03).abs() < 1e-6 && (landings.mean_error + 0.02).abs() < 1e-6);
     }

@@ -1,10 +1,11 @@
-//! Sums over the steps of walking robots: velocity errors, the motion of the feet, power.
+//! Velocity errors, the motion of the feet and power of walking robots.
 
 use glam::Vec3;
 use serde::Serialize;
-use twinstep_model::{EnvSpec, Feet, SpecField};
+use twinstep_learning::VelocityLayout;
+use twinstep_model::{EnvError, EnvSpec, Feet, SpecField};
 
-use crate::statistics::VelocityLayout;
+use crate::{Measure, MeasureError, Step, share_up};
 
 /// Time after a change of the command that is left out of the settled errors [s].
 const TRANSIENT_S: f64 = 1.0;
@@ -66,8 +67,42 @@ pub struct SpeedBin {
     pub yaw_rate_rms: f64,
 }
 
+/// Measures how robots follow velocity commands.
+pub struct Walking {
+    robots: Robots,
+    walkers: Vec<Walker>,
+    sums: Sums,
+    steps: usize,
+}
+
+impl Walking {
+    /// Prepares the measure of robots with these feet and torque limits [N·m].
+    pub fn new(spec: &EnvSpec, num_envs: usize, feet: &Feet, torque_limits: &[f64]) -> Result<Self, MeasureError> {
+        let robots = Robots::new(spec, feet, torque_limits).map_err(MeasureError::Missing)?;
+        Ok(Self { robots, walkers: vec![Walker::new(feet.len()); num_envs], sums: Sums::default(), steps: 0 })
+    }
+}
+
+impl Measure for Walking {
+    type Found = Evaluation;
+
+    fn add(&mut self, step: &mut Step<'_>) -> Result<(), EnvError> {
+        self.steps += 1;
+        for robot in step.robots() {
+            let observations = [step.before, &step.batch.obs, &step.batch.critic_obs];
+            self.walkers[robot].add(&mut self.sums, &self.robots, robot, observations);
+        }
+        Ok(())
+    }
+
+    fn found(self, has_fallen: &[bool]) -> Evaluation {
+        let seconds = self.steps as f64 * self.robots.policy_dt;
+        self.sums.evaluation(has_fallen.len(), share_up(has_fallen), seconds, &self.robots)
+    }
+}
+
 /// What the robots have in common: the layout of their observations, their gains and limbs.
-pub struct Robots {
+struct Robots {
     obs_len: usize,
     critic_len: usize,
     policy_dt: f64,
@@ -91,7 +126,7 @@ pub struct Robots {
 
 impl Robots {
     /// Returns the name of a quantity that is not observed, if there is one, as error.
-    pub fn new(spec: &EnvSpec, feet: &Feet, torque_limits: &[f64]) -> Result<Self, &'static str> {
+    fn new(spec: &EnvSpec, feet: &Feet, torque_limits: &[f64]) -> Result<Self, &'static str> {
         let find = |fields: &[SpecField], name: &'static str| {
             let index = fields.iter().position(|field| field.name == name).ok_or(name)?;
             Ok::<_, &'static str>(fields[..index].iter().map(|field| field.size).sum::<usize>())
@@ -136,9 +171,7 @@ impl Robots {
 
 /// Motion of one robot so far.
 #[derive(Clone, Default)]
-pub struct Walker {
-    /// True from its first fall on.
-    pub has_fallen: bool,
+struct Walker {
     /// Steps since the command changed.
     steps_of_command: usize,
     command: [f32; 3],
@@ -149,14 +182,14 @@ pub struct Walker {
 
 impl Walker {
     /// Returns a robot with this number of feet, before its first step.
-    pub fn new(feet: usize) -> Self {
+    fn new(feet: usize) -> Self {
         Self { air_steps: vec![0; feet], peak: vec![0.0; feet], ..Self::default() }
     }
 
     /// Adds a step of robot `index` to `sums`.
     ///
     /// `observations` of all robots are those of group `policy` before and after the step, and of group `critic` after it.
-    pub fn add(&mut self, sums: &mut Sums, robots: &Robots, index: usize, observations: [&[f32]; 3]) {
+    fn add(&mut self, sums: &mut Sums, robots: &Robots, index: usize, observations: [&[f32]; 3]) {
         let [before, after, critic] = observations;
         let errors = robots.velocity.squared_errors(before, critic, index).map(f64::from);
         let obs = &after[index * robots.obs_len..][..robots.obs_len];
@@ -233,7 +266,7 @@ impl Errors {
 
 /// Sums over all robots.
 #[derive(Default)]
-pub struct Sums {
+struct Sums {
     all: Errors,
     settled: Errors,
     by_speed: [Errors; SPEED_BINS.len() + 1],
@@ -245,8 +278,8 @@ pub struct Sums {
 }
 
 impl Sums {
-    /// Returns the evaluation of `count` robots, of which `up` did not fall in `seconds` seconds.
-    pub fn evaluation(mut self, count: usize, up: usize, seconds: f64, robots: &Robots) -> Evaluation {
+    /// Returns the evaluation of `count` robots, of which a share `up` did not fall in `seconds` seconds.
+    fn evaluation(mut self, count: usize, up: f64, seconds: f64, robots: &Robots) -> Evaluation {
         self.swing_heights.sort_by(f32::total_cmp);
         let moving_steps = self.moving_steps.max(1) as f64;
         let foot_steps = robots.feet.len() as f64 * moving_steps;
@@ -260,7 +293,7 @@ impl Sums {
         Evaluation {
             robots: count,
             seconds,
-            up: up as f64 / count as f64,
+            up,
             velocity_rms,
             settled_velocity_rms,
             yaw_rate_rms,
