@@ -36,6 +36,17 @@ from .errors import (
 )
 from .factory import EnvFactory
 from .grouped import GroupedVecEnv
+from .measured import (
+    CommandError,
+    Diagnosis,
+    Effect,
+    Estimate,
+    Identification,
+    ModelErrors,
+    diagnose,
+    evaluate,
+    identify,
+)
 from .options import ConnectOptions
 from .remote import RemoteVecEnv
 from .rollout import GaussianPolicy, Trajectory
@@ -51,19 +62,25 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AmbiguousRobotError",
+    "CommandError",
     "ConnectOptions",
+    "Diagnosis",
+    "Effect",
     "EmbeddedServer",
     "EnvFactory",
     "Error",
+    "Estimate",
     "ForkedProcessError",
     "GaussianPolicy",
     "Go2Env",
     "Go2VectorEnv",
     "GroupedVecEnv",
+    "Identification",
     "InvalidActionError",
     "InvalidOptionError",
     "LeaseLostError",
     "MalformedError",
+    "ModelErrors",
     "NoServerError",
     "NotPicklableError",
     "RemoteVecEnv",
@@ -83,7 +100,10 @@ __all__ = [
     "VecEnvError",
     "VersionError",
     "check_vec_env",
+    "diagnose",
     "discover",
+    "evaluate",
+    "identify",
     "stop_robot",
 ]
 

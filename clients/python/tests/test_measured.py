@@ -1,0 +1,89 @@
+"""Evaluation, identification and diagnosis from Python."""
+
+import csv
+import json
+import math
+from pathlib import Path
+
+import pytest
+import twinstep
+
+KP, KD, RATE_HZ = 20.0, 0.5, 200
+INERTIA, MASS, LENGTH = 0.02, 0.5, 0.2
+HIDDEN_VISCOUS = 0.4
+
+ARM = f"""<robot name="arm"><link name="base"/>
+<joint name="elbow" type="revolute"><parent link="base"/><child link="forearm"/><axis xyz="0 1 0"/>
+<limit lower="-2" upper="2" effort="20" velocity="20"/></joint>
+<link name="forearm"><inertial><origin xyz="0 0 -{LENGTH}"/><mass value="{MASS}"/>
+<inertia ixx="{INERTIA}" iyy="{INERTIA}" izz="{INERTIA}" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
+
+
+@pytest.fixture
+def arm(tmp_path: Path) -> tuple[Path, Path]:
+    """Return the file of an arm of one joint, and a log of one with viscous friction that the file lacks."""
+    robot, log = tmp_path / "arm.urdf", tmp_path / "log"
+    robot.write_text(ARM)
+    log.mkdir()
+    meta = {
+        "rate_hz": RATE_HZ,
+        "joints": ["elbow"],
+        "tau_sensor": "motor_current",
+        "segments": [{"name": "sines", "base": "fixed"}],
+        "kp": KP,
+        "kd": KD,
+    }
+    (log / "meta.json").write_text(json.dumps(meta))
+    q = dq = torque = 0.0
+    steps = 20
+    dt = 1 / (RATE_HZ * steps)
+    with open(log / "data.csv", "w", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(["t", "segment", "q_cmd_elbow", "q_elbow", "dq_elbow", "tau_measured_elbow"])
+        for row in range(20 * RATE_HZ):
+            t = row / RATE_HZ
+            wanted = 0.6 * math.sin(2 * math.pi * 0.4 * t) + 0.3 * math.sin(2 * math.pi * 1.7 * t)
+            start = [f"{value:.9f}" for value in (t, 0, wanted, q, dq)]
+            torque = KP * (wanted - q) - KD * dq
+            mean = 0.0
+            for _ in range(steps):
+                gravity = MASS * 9.81 * LENGTH * math.sin(q)
+                dq += dt * (torque - HIDDEN_VISCOUS * dq - gravity) / (INERTIA + MASS * LENGTH**2)
+                q += dt * dq
+                mean += torque / steps
+            rows.writerow([*start, f"{mean:.9f}"])
+    return robot, log
+
+
+def test_diagnosis_names_the_hidden_friction_with_its_size(arm: tuple[Path, Path], tmp_path: Path) -> None:
+    robot, log = arm
+    found = twinstep.diagnose(log, model=robot, out=tmp_path / "diagnosis")
+    assert [cause.name for cause in found.causes] == ["viscous_friction"]
+    estimate = next(iter(found.causes[0].parameters.values()))
+    assert estimate.value == pytest.approx(HIDDEN_VISCOUS, rel=0.15)
+    assert found.baseline.q_rad is not None
+    assert found.extended.q_rad is not None
+    assert found.extended.q_rad < 0.3 * found.baseline.q_rad
+    assert found.model.exists()
+    assert "viscous_friction" in found._repr_html_()
+
+
+def test_identification_returns_estimates_with_intervals(arm: tuple[Path, Path], tmp_path: Path) -> None:
+    robot, log = arm
+    out = tmp_path / "fitted.toml"
+    found = twinstep.identify([log], model=robot, effects=["viscous_friction@all"], out=out)
+    (effect,) = found.effects
+    estimate = effect.parameters["coefficient_nms"]
+    assert estimate.value == pytest.approx(HIDDEN_VISCOUS, rel=0.1)
+    assert isinstance(estimate.low, float)
+    assert isinstance(estimate.high, float)
+    assert estimate.low < HIDDEN_VISCOUS < estimate.high
+    before, after = twinstep.evaluate(log, model=robot), twinstep.evaluate(log, model=out)
+    assert before.q_rad is not None
+    assert after.q_rad is not None
+    assert after.q_rad < 0.3 * before.q_rad
+
+
+def test_bad_input_has_the_message_of_the_program(tmp_path: Path) -> None:
+    with pytest.raises(twinstep.InvalidOptionError, match="nothing_here"):
+        twinstep.evaluate(tmp_path / "nothing_here")
