@@ -43,7 +43,8 @@ fn paragraphs(text: &str) -> Vec<String> {
         }
         if !in_code && !start.starts_with(['|', '#', '!']) && !start.starts_with("```") {
             let last = found.len() - 1;
-            found[last] += &format!(" {line}");
+            found[last].push(' ');
+            found[last].push_str(line);
         }
     }
     found.iter().map(|paragraph| without_code(&without_addresses(paragraph))).collect()

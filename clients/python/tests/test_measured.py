@@ -71,14 +71,14 @@ def test_diagnosis_names_the_hidden_friction_with_its_size(arm: tuple[Path, Path
 def test_identification_returns_estimates_with_intervals(arm: tuple[Path, Path], tmp_path: Path) -> None:
     robot, log = arm
     out = tmp_path / "fitted.toml"
-    found = twinstep.identify([log], model=robot, effects=["viscous_friction@all"], out=out)
+    found = twinstep.identify([log], model=robot, effects=["viscous_friction@all"], out=out, until_s=10.0)
     (effect,) = found.effects
     estimate = effect.parameters["coefficient_nms"]
     assert estimate.value == pytest.approx(HIDDEN_VISCOUS, rel=0.1)
     assert isinstance(estimate.low, float)
     assert isinstance(estimate.high, float)
     assert estimate.low < HIDDEN_VISCOUS < estimate.high
-    before, after = twinstep.evaluate(log, model=robot), twinstep.evaluate(log, model=out)
+    before, after = (twinstep.evaluate(log, model=model, from_s=10.0) for model in (robot, out))
     assert before.q_rad is not None
     assert after.q_rad is not None
     assert after.q_rad < 0.3 * before.q_rad

@@ -57,7 +57,7 @@ fn write_pages(folder: &Path) -> CommandResult {
     std::fs::create_dir_all(folder).map_err(|cause| {
         Failure::Input(miette::miette!("`--pages` = {}: cannot create the folder: {cause}", folder.display()))
     })?;
-    let write = |name: String, text: String| twinstep_files::write(&folder.join(name), text).map_err(input);
+    let write = |name: String, text: String| twinstep_files::write(folder.join(name), text).map_err(input);
     for effect in CATALOGUE {
         eprintln!("{}", effect.name);
         effect_plot::write_svg(effect, &folder.join(format!("{}.svg", effect.name))).map_err(input)?;

@@ -45,8 +45,10 @@ fn line(name: &str, about: &str) -> String {
     for word in about.trim_end_matches('.').split_whitespace() {
         let now = lines.last_mut().expect("a first line");
         if now.chars().count() + word.chars().count() < last {
-            let space = if now.ends_with(' ') { "" } else { " " };
-            now.push_str(&format!("{space}{word}"));
+            if !now.ends_with(' ') {
+                now.push(' ');
+            }
+            now.push_str(word);
         } else {
             lines.push(format!("{}{word}", " ".repeat(first)));
         }

@@ -47,7 +47,7 @@ mod serve;
 mod spi_active;
 mod spi_active_config;
 mod spi_active_report;
-mod stage_files;
+mod stages;
 mod status_line;
 mod stop_signals;
 mod train;

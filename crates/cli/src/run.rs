@@ -195,6 +195,30 @@ pub fn record(args: &Args, signals: &Signals) -> Result<Recording, Failure> {
 }
 
 impl Args {
+    /// Returns the arguments with which `policy` follows the commands in a file for some time [s] and records `log`.
+    pub fn recording(policy: &Path, commands: &Path, log: &Path, seconds: f64) -> Self {
+        Self {
+            policy: policy.to_owned(),
+            mapping: None,
+            endpoint: String::new(),
+            robot: None,
+            zenoh: None,
+            log: Some(log.to_owned()),
+            torque: false,
+            velocity: None,
+            commands: Some(commands.to_owned()),
+            keyboard: false,
+            gamepad: None,
+            seconds: Some(seconds),
+            action_noise: 0.0,
+            go_on: false,
+            fast: false,
+            seed: 1,
+            json: false,
+            view: ViewArgs::default(),
+        }
+    }
+
     fn options(&self, signals: &Signals) -> ConnectOptions {
         ConnectOptions {
             interrupted: signals.flag(),

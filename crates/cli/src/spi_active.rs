@@ -2,10 +2,10 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::exit::{CommandResult, Failure, Signals, other};
+use crate::exit::{CommandResult, Failure, Signals};
 use crate::spi_active_config::{Method, SpiActiveConfig};
 use crate::spi_active_report::{self, RobotTime, StageResult};
-use crate::{excite, identify, run};
+use crate::{excite, identify, stages};
 
 /// Identify a robot with the two stages of SPI-Active: ordinary commands first, then designed ones.
 ///
@@ -57,20 +57,12 @@ const HELD_OUT_SEED: u64 = 1_000_000;
 pub fn run(args: &Args) -> CommandResult {
     let signals = Signals::listen()?;
     let config = SpiActiveConfig::load(&args.config)?;
-    let out = args.config.with_extension("");
-    if out == args.config {
-        let path = out.display();
-        return Err(Failure::Input(miette::miette!("`{path}`: the config file needs an extension, such as .toml")));
-    }
-    open_folder(&out, &config)?;
-    let result = stages(&config, &out, &signals);
-    if matches!(result, Err(Failure::Interrupted)) {
-        eprintln!("interrupted; the same command continues");
-    }
-    result
+    let out = stages::folder_of(&args.config)?;
+    stages::keep_inputs(&out, config.inputs()?)?;
+    stages::ended(all_stages(&config, &out, &signals))
 }
 
-fn stages(config: &SpiActiveConfig, out: &Path, signals: &Signals) -> CommandResult {
+fn all_stages(config: &SpiActiveConfig, out: &Path, signals: &Signals) -> CommandResult {
     let mut logs = Vec::new();
     let mut results = Vec::new();
     let mut model = config.model.clone();
@@ -98,30 +90,9 @@ fn stages(config: &SpiActiveConfig, out: &Path, signals: &Signals) -> CommandRes
     held_out.commands(|path| commands.write(path, signals))?;
     let robot_time = held_out.collect(config, signals)?;
     let report = spi_active_report::report(config, &results, &held_out.log(), robot_time)?;
-    write(&out.join("report.md"), &report)?;
+    stages::write(&out.join("report.md"), report.as_bytes())?;
     print!("{report}");
     println!("\nwritten to {}", out.join("report.md").display());
-    Ok(())
-}
-
-/// Creates the folder of the results with copies of the inputs, or fails if it has results of other inputs.
-fn open_folder(out: &Path, config: &SpiActiveConfig) -> CommandResult {
-    let inputs = out.join("inputs");
-    std::fs::create_dir_all(&inputs).map_err(|cause| unwritable(&inputs, &cause))?;
-    for (name, content) in config.inputs()? {
-        let copy = inputs.join(name);
-        match std::fs::read(&copy) {
-            Ok(earlier) if earlier != content => {
-                return Err(Failure::Input(miette::miette!(
-                    "{} has results of other inputs: {name} differs\n  restore it from {}, or rename the config file",
-                    out.display(),
-                    inputs.display()
-                )));
-            }
-            Ok(_) => {}
-            Err(_) => twinstep_files::write(&copy, content).map_err(|cause| unwritable(&copy, &cause))?,
-        }
-    }
     Ok(())
 }
 
@@ -134,7 +105,7 @@ struct Stage {
 impl Stage {
     fn new(out: &Path, name: &str) -> Result<Self, Failure> {
         let folder = out.join(name);
-        std::fs::create_dir_all(&folder).map_err(|cause| unwritable(&folder, &cause))?;
+        stages::create_folder(&folder)?;
         Ok(Self { name: name.to_owned(), folder })
     }
 
@@ -153,36 +124,25 @@ impl Stage {
             return Ok(());
         }
         let partial = self.folder.join("design.partial");
-        std::fs::create_dir_all(&partial).map_err(|cause| unwritable(&partial, &cause))?;
+        stages::create_folder(&partial)?;
         choose(&partial.join("commands.csv"))?;
         for name in ["design.json", "commands.csv"] {
             let (from, to) = (partial.join(name), self.folder.join(name));
             if from.exists() {
-                twinstep_files::complete(&from, &to).map_err(|cause| unwritable(&to, &cause))?;
+                stages::complete(&from, &to)?;
             }
         }
-        std::fs::remove_dir_all(&partial).map_err(|cause| unwritable(&partial, &cause))
+        stages::discard(&partial)
     }
 
     /// Records the log, unless it is there.
     fn collect(&self, config: &SpiActiveConfig, signals: &Signals) -> Result<RobotTime, Failure> {
         let (log, summary) = (self.log(), self.folder.join("run.json"));
-        if log.exists() && summary.exists() {
-            return read_json(&summary);
-        }
-        let partial = self.folder.join("log.partial");
-        for interrupted in [&partial, &log].into_iter().filter(|path| path.exists()) {
-            std::fs::remove_dir_all(interrupted).map_err(|cause| unwritable(interrupted, &cause))?;
-        }
-        let recorded = run::record(&config.recording(&self.folder.join("commands.csv"), &partial), signals)?.summary;
-        // SIGTERM ends a run as its duration does.
-        if signals.check()? || recorded.seconds < config.seconds - 1e-6 {
-            return Err(Failure::Interrupted);
-        }
-        let found = RobotTime { seconds: recorded.seconds, falls: recorded.falls };
-        write(&summary, &serde_json::to_string_pretty(&found).map_err(other)?)?;
-        twinstep_files::complete(&partial, &log).map_err(|cause| unwritable(&log, &cause))?;
-        Ok(found)
+        let commands = self.folder.join("commands.csv");
+        let recording = |partial: &Path| config.recording(&commands, partial);
+        stages::recorded((&log, &summary), config.seconds, recording, signals, |run, _| {
+            Ok(RobotTime { seconds: run.seconds, falls: run.falls })
+        })
     }
 
     /// Identifies the model from `logs`, unless it is there.
@@ -199,20 +159,6 @@ impl Stage {
         }
         let search = identify::search_file(&partial);
         identify::write_model(&config.identification(logs, earlier, &partial, search.exists()), signals)?;
-        twinstep_files::complete(&partial, &model).map_err(|cause| unwritable(&model, &cause))
+        stages::complete(&partial, &model)
     }
-}
-
-fn read_json(path: &Path) -> Result<RobotTime, Failure> {
-    let wrong = |cause: String| Failure::Input(miette::miette!("cannot read {}: {cause}", path.display()));
-    let text = std::fs::read_to_string(path).map_err(|error| wrong(error.to_string()))?;
-    serde_json::from_str(&text).map_err(|error| wrong(error.to_string()))
-}
-
-fn write(path: &Path, text: &str) -> CommandResult {
-    twinstep_files::write(path, text).map_err(|cause| unwritable(path, &cause))
-}
-
-fn unwritable(path: &Path, cause: &std::io::Error) -> Failure {
-    Failure::Input(miette::miette!("cannot write {}: {cause}", path.display()))
 }

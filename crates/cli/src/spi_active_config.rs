@@ -11,7 +11,6 @@ use twinstep_policy::Policy;
 use crate::exit::{Failure, input};
 use crate::random_commands::RandomCommands;
 use crate::robot_file::analytic_model;
-use crate::web_view::ViewArgs;
 use crate::{excite, identify, run};
 
 /// How the commands after the first stage are chosen.
@@ -226,24 +225,12 @@ impl SpiActiveConfig {
     /// Returns the arguments of `twinstep run`, which follows the commands in a file and records the folder `log`.
     pub fn recording(&self, commands: &Path, log: &Path) -> run::Args {
         run::Args {
-            policy: self.policy.clone(),
-            mapping: None,
             endpoint: self.endpoint.clone(),
             robot: self.robot.clone(),
             zenoh: self.zenoh.clone(),
-            log: Some(log.to_owned()),
-            torque: false,
-            velocity: None,
-            commands: Some(commands.to_owned()),
-            keyboard: false,
-            gamepad: None,
-            seconds: Some(self.seconds),
-            action_noise: 0.0,
             fast: self.fast,
-            go_on: false,
             seed: self.seed,
-            json: false,
-            view: ViewArgs::default(),
+            ..run::Args::recording(&self.policy, commands, log, self.seconds)
         }
     }
 

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use crate::exit::{CommandResult, Failure, Signals, other};
 use crate::u2e_config::{Method, Stop, U2eConfig, has_converged};
 use crate::u2e_evaluation::{Collection, Evaluation};
-use crate::{fit, run, stage_files, train, u2e_report};
+use crate::{fit, stages, train, u2e_report};
 
 /// Learn the actuators of a robot with uncertainty-guided exploration (U2E).
 ///
@@ -63,17 +63,9 @@ pub struct Args {
 pub fn run(args: &Args) -> CommandResult {
     let signals = Signals::listen()?;
     let config = U2eConfig::load(&args.config)?;
-    let out = args.config.with_extension("");
-    if out == args.config {
-        let path = out.display();
-        return Err(Failure::Input(miette::miette!("`{path}`: the config file needs an extension, such as .toml")));
-    }
-    stage_files::keep_inputs(&out, config.inputs()?)?;
-    let result = iterations(&config, &out, &signals);
-    if matches!(result, Err(Failure::Interrupted)) {
-        eprintln!("interrupted; the same command continues");
-    }
-    result
+    let out = stages::folder_of(&args.config)?;
+    stages::keep_inputs(&out, config.inputs()?)?;
+    stages::ended(iterations(&config, &out, &signals))
 }
 
 fn iterations(config: &U2eConfig, out: &Path, signals: &Signals) -> CommandResult {
@@ -90,7 +82,7 @@ fn iterations(config: &U2eConfig, out: &Path, signals: &Signals) -> CommandResul
         let uncertainties: Vec<f64> = evaluations.iter().filter_map(|evaluation| evaluation.uncertainty).collect();
         let ends = config.stop == Stop::Uncertainty && has_converged(&uncertainties, config.threshold);
         let robot = config.simulated_robot(Path::new(&stages[iteration].name).join("ensemble.safetensors"))?;
-        stage_files::write(&out.join("robot.toml"), robot.as_bytes())?;
+        stages::write(&out.join("robot.toml"), robot.as_bytes())?;
         let report = u2e_report::write(config, out, &evaluations, ends)?;
         if ends || iteration == config.iterations {
             print!("{report}");
@@ -113,17 +105,17 @@ fn fit_and_evaluate(
     let (stage, earlier) = stages.split_last().expect("a stage was added");
     let path = stage.folder.join("evaluation.json");
     if path.exists() && stage.ensemble().exists() {
-        return read_json(&path);
+        return stages::read_json(&path);
     }
     let logs: Vec<PathBuf> = stages.iter().map(Stage::log).collect();
     if !stage.ensemble().exists() {
         let partial = stage.folder.join("ensemble.partial.safetensors");
         fit::write_ensemble(&config.fitting(logs.clone(), earlier.last().map(Stage::ensemble), &partial), signals)?;
-        stage_files::complete(&partial, &stage.ensemble())?;
+        stages::complete(&partial, &stage.ensemble())?;
     }
     let ensembles: Vec<PathBuf> = stages.iter().map(Stage::ensemble).collect();
     let evaluation = Evaluation::new(&stage.name, collection, &ensembles, &logs, config.held_out.as_deref())?;
-    stage_files::write(&path, serde_json::to_string_pretty(&evaluation).map_err(other)?.as_bytes())?;
+    stages::write_json(&path, &evaluation)?;
     Ok(evaluation)
 }
 
@@ -144,7 +136,7 @@ impl Stage {
         };
         let name = format!("{iteration}-{kind}");
         let folder = out.join(&name);
-        stage_files::create_folder(&folder)?;
+        stages::create_folder(&folder)?;
         Ok(Self { iteration, name, folder })
     }
 
@@ -166,13 +158,13 @@ impl Stage {
         }
         let (model, settings) = (self.folder.join("simulation.toml"), self.folder.join("training.toml"));
         let ensemble = Path::new("..").join(&earlier.name).join("ensemble.safetensors");
-        stage_files::write(&model, config.simulated_robot(ensemble)?.as_bytes())?;
-        stage_files::write(&settings, config.training(model).as_bytes())?;
+        stages::write(&model, config.simulated_robot(ensemble)?.as_bytes())?;
+        stages::write(&settings, config.training(model).as_bytes())?;
         let training = self.folder.join("training");
         train::write_policy(&config.exploration(&settings, &training, self.iteration), signals)?;
         let partial = self.folder.join("policy.partial.safetensors");
         std::fs::copy(training.join("exploration.safetensors"), &partial).map_err(other)?;
-        stage_files::complete(&partial, &policy)?;
+        stages::complete(&partial, &policy)?;
         Ok(policy)
     }
 
@@ -183,35 +175,14 @@ impl Stage {
             return Ok(());
         }
         config.commands(self.iteration).write(&partial, signals)?;
-        stage_files::complete(&partial, &path)
+        stages::complete(&partial, &path)
     }
 
     /// Records the log, unless it is there. An incomplete log is never kept.
     fn collect(&self, config: &U2eConfig, policy: &Path, signals: &Signals) -> Result<Collection, Failure> {
         let (log, summary) = (self.log(), self.folder.join("run.json"));
-        if log.exists() && summary.exists() {
-            return read_json(&summary);
-        }
-        let partial = self.folder.join("log.partial");
-        stage_files::discard(&partial)?;
-        stage_files::discard(&log)?;
         let commands = self.folder.join("commands.csv");
-        let recorded = run::record(&config.recording(policy, &commands, &partial, self.iteration), signals)?.summary;
-        // SIGTERM ends a run as its duration does.
-        if signals.check()? || recorded.seconds < config.seconds - 1e-6 {
-            return Err(Failure::Interrupted);
-        }
-        let found = Collection::new(&recorded, &partial)?;
-        stage_files::write(&summary, serde_json::to_string_pretty(&found).map_err(other)?.as_bytes())?;
-        stage_files::complete(&partial, &log)?;
-        Ok(found)
+        let recording = |partial: &Path| config.recording(policy, &commands, partial, self.iteration);
+        stages::recorded((&log, &summary), config.seconds, recording, signals, Collection::new)
     }
-}
-
-fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T, Failure> {
-    let wrong = |cause: String| {
-        Failure::Input(miette::miette!("cannot read {}: {cause}\n  remove it to repeat its stage", path.display()))
-    };
-    let text = std::fs::read_to_string(path).map_err(|error| wrong(error.to_string()))?;
-    serde_json::from_str(&text).map_err(|error| wrong(error.to_string()))
 }

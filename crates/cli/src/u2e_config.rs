@@ -17,7 +17,6 @@ use crate::fit::JointEncodingArg;
 use crate::random_commands::RandomCommands;
 use crate::robot_file::analytic_model;
 use crate::train_config::TrainConfig;
-use crate::web_view::ViewArgs;
 use crate::{excite, fit, open_log, run, train};
 
 /// How the logs after the first one are collected.
@@ -278,24 +277,14 @@ impl U2eConfig {
     pub fn recording(&self, policy: &Path, commands: &Path, log: &Path, iteration: usize) -> run::Args {
         let is_noisy = self.method == Method::Random && iteration > 0;
         run::Args {
-            policy: policy.to_owned(),
-            mapping: None,
             endpoint: self.endpoint.clone(),
             robot: self.robot.clone(),
             zenoh: self.zenoh.clone(),
-            log: Some(log.to_owned()),
             torque: true,
-            velocity: None,
-            commands: Some(commands.to_owned()),
-            keyboard: false,
-            gamepad: None,
-            seconds: Some(self.seconds),
             action_noise: if is_noisy { self.action_noise } else { 0.0 },
             fast: self.fast,
-            go_on: false,
             seed: self.seed + iteration as u64,
-            json: false,
-            view: ViewArgs::default(),
+            ..run::Args::recording(policy, commands, log, self.seconds)
         }
     }
 

@@ -6,7 +6,7 @@ use std::path::Path;
 use twinstep_report::chart::{self, INK, Line, ORANGE, Panel, PlotError};
 
 use crate::exit::{Failure, other};
-use crate::stage_files;
+use crate::stages;
 use crate::u2e_config::{U2eConfig, relative_decrease};
 use crate::u2e_evaluation::{Errors, Evaluation};
 
@@ -24,10 +24,10 @@ pub fn write(config: &U2eConfig, out: &Path, evaluations: &[Evaluation], converg
         _ => "It continues.".to_owned(),
     };
     let report = format!("# U2E\n\n{end}\n\n{}\n{}", iterations(evaluations), cross_table(evaluations));
-    stage_files::write(&out.join("report.md"), report.as_bytes())?;
+    stages::write(&out.join("report.md"), report.as_bytes())?;
     let svg = picture(evaluations).map_err(other)?;
     let page = page(&report, &svg, is_last);
-    stage_files::write(&out.join("progress.html"), page.as_bytes())?;
+    stages::write(&out.join("progress.html"), page.as_bytes())?;
     Ok(report)
 }
 

@@ -1,7 +1,7 @@
 //! Entries of a model file, and their application to a robot.
 
 use super::{Composition, Effect, EffectSite, LEAST_SUM, Scope, Target};
-use twinstep_model::{ActuatorParams, Joint, RobotModel};
+use twinstep_model::{ActuatorParams, Joint, RigidBody, RobotModel};
 
 /// Effect with its scope and values.
 #[derive(Clone, Debug, PartialEq)]
@@ -160,10 +160,5 @@ fn check_robot(robot: &RobotModel) -> Option<&'static str> {
         }
     }
     let bodies = robot.legs.iter().flat_map(|leg| &leg.bodies).chain([&robot.trunk]);
-    let definite = |body: &twinstep_model::RigidBody| {
-        let i = &body.inertia;
-        let minor = i.x_axis.x * i.y_axis.y - i.x_axis.y * i.y_axis.x;
-        body.mass > 0.0 && i.x_axis.x > 0.0 && minor > 0.0 && i.determinant() > 0.0
-    };
-    (!bodies.into_iter().all(definite)).then_some("a body's mass or inertia is no longer positive")
+    (!bodies.into_iter().all(RigidBody::is_physical)).then_some("a body's mass or inertia is no longer positive")
 }

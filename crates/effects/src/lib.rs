@@ -2,6 +2,7 @@
 //!
 //! - [`Effect`]: an effect of the catalogue: equation, parameters, signature in data, confounders, and the change of a
 //!   [`RobotModel`]. One file per effect.
+//! - [`LawForm`]: an effect as equations of motion see it, with its priors.
 //! - [`Search`], [`Visibility`], [`Variable`], [`demo`]: how diagnosis searches for an effect and how it is plotted.
 //! - [`CATALOGUE`]: all effects, in the order of the chain from command to motion.
 //! - [`Scope`]: the joints or the part of the robot to which an entry of a model file applies.
@@ -16,6 +17,7 @@ mod catalogue;
 mod data_requirement;
 pub mod demo;
 mod entry;
+mod law;
 mod model_file;
 mod nominal;
 mod parse_toml;
@@ -28,6 +30,7 @@ pub use catalogue::CATALOGUE;
 pub use data_requirement::{DataRequirement, LOW_SPEED};
 pub use demo::{DemoMotion, EffectDemo, PlotQuantity};
 pub use entry::{EffectEntry, EntryError, apply_effects};
+pub use law::{LawForm, Place, Presence, Shapes};
 pub use model_file::{
     ActuatorNetworkConfig, EffectEntryError, JointEffect, JointScope, MemberSampling, ModelFile, ModelFileError,
     NetworkMode, NominalGain, ShapeText, TreeGroups, TreeModelFile, load_robot, parse_robot,
@@ -84,6 +87,10 @@ pub struct Effect {
     pub demo: EffectDemo,
     /// What a log of the blind test must contain for it to be hidden there. `None`: it is not hidden.
     pub blind_test: Option<&'static [BlindTestCondition]>,
+    /// The effect in the equations of motion. Empty for effects that diagnosis by equations does not look for.
+    pub laws: &'static [LawForm],
+    /// Returns what a joint has of it, if values add up.
+    pub amount: Option<fn(&JointModel) -> f64>,
     /// What it changes. The values of a parameter are contiguous.
     pub apply: Apply,
 }
@@ -210,19 +217,14 @@ impl Effect {
         }
     }
 
-    /// Returns true if values add up to a sum that cannot be negative.
+    /// Returns true if values add up to a sum that cannot be negative, so that an entry may take away what a robot's file states.
     pub fn is_of_sum(&self) -> bool {
-        matches!(self.name, "coulomb_friction" | "viscous_friction" | "armature")
+        self.amount.is_some() && self.parameters[0].bounds[0] < 0.0
     }
 
-    /// Returns what a joint has of an effect whose values add up to a sum that cannot be negative: an entry can take away that much.
+    /// Returns what a joint has of it, zero if values do not add up.
     pub fn amount(&self, joint: &JointModel) -> f64 {
-        match self.name {
-            "coulomb_friction" => joint.coulomb_friction,
-            "viscous_friction" => joint.viscous_friction,
-            "armature" => joint.armature,
-            _ => 0.0,
-        }
+        self.amount.map_or(0.0, |amount| amount(joint))
     }
 
     /// Returns the number of components of all parameters.

@@ -39,6 +39,13 @@ impl RigidBody {
         Self { mass, com, inertia: about_com(&self) + about_com(&other) }
     }
 
+    /// Returns true if mass and inertia are positive.
+    pub fn is_physical(&self) -> bool {
+        let Self { mass, inertia: i, .. } = self;
+        let minor = i.x_axis.x * i.y_axis.y - i.x_axis.y * i.y_axis.x;
+        *mass > 0.0 && i.x_axis.x > 0.0 && minor > 0.0 && i.determinant() > 0.0
+    }
+
     /// Returns the body with a point mass [kg] fixed to it at `position` [m, body frame].
     pub fn with_point_mass(self, mass: f64, position: DVec3) -> Self {
         let total = self.mass + mass;

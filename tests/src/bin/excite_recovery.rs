@@ -1,7 +1,7 @@
 //! Active identification on another engine: walking robots in MuJoCo with hidden parameters follow random and designed
 //! velocity commands for equal times, and are identified from the logs.
 //!
-//! `cargo build --release --workspace && target/release/excite_recovery > results/excite.md`. Needs Python with the
+//! `cargo build --release --workspace && target/release/excite_recovery`. Needs Python with the
 //! package's extra `mujoco`; `TWINSTEP_PYTHON` is its interpreter.
 
 use std::time::Instant;

@@ -104,7 +104,9 @@ class Diagnosis:
         return f'<iframe srcdoc="{page}" width="100%" height="700" style="border: 0"></iframe>'
 
 
-def evaluate(log: File, *, model: File | None = None) -> ModelErrors:
+def evaluate(
+    log: File, *, model: File | None = None, from_s: float | None = None, until_s: float | None = None
+) -> ModelErrors:
     """Return the errors of a model on a log.
 
     Parameters
@@ -113,6 +115,8 @@ def evaluate(log: File, *, model: File | None = None) -> ModelErrors:
         A data file, or a folder that contains one.
     model
         Model file, robot file (URDF, MJCF), or the name of a robot of the program. Default: the ideal Go2.
+    from_s, until_s
+        First and last time of the rows that are compared [s]. Default: all rows.
 
     Raises
     ------
@@ -124,12 +128,19 @@ def evaluate(log: File, *, model: File | None = None) -> ModelErrors:
     >>> twinstep.evaluate("data/go2_air_chirp").q_rad  # doctest: +SKIP
     0.0359
     """
-    found = json.loads(_run(["evaluate", fspath(log), "--json", *_option("--model", model)]))
+    rows = _rows(from_s, until_s)
+    found = json.loads(_run(["evaluate", fspath(log), "--json", *rows, *_option("--model", model)]))
     return _errors(found)
 
 
 def identify(
-    logs: File | Sequence[File], *, out: File, effects: Sequence[str] | None = None, model: File | None = None
+    logs: File | Sequence[File],
+    *,
+    out: File,
+    effects: Sequence[str] | None = None,
+    model: File | None = None,
+    from_s: float | None = None,
+    until_s: float | None = None,
 ) -> Identification:
     """Estimate parameters of effects from logs of one robot, and write the model file ``out``.
 
@@ -141,7 +152,7 @@ def identify(
         Model file to write (TOML).
     effects
         Effects with scopes, as in ``["coulomb_friction@calf", "payload@base"]``. Default: those of the command.
-    model
+    model, from_s, until_s
         As of :func:`evaluate`.
 
     Raises
@@ -150,7 +161,8 @@ def identify(
         A log, an effect or the model cannot be used; the message says why.
     """
     listed = ["--effects", ",".join(effects)] if effects else []
-    _run(["identify", *_paths(logs), "--out", fspath(out), *listed, *_option("--model", model)])
+    rows = _rows(from_s, until_s)
+    _run(["identify", *_paths(logs), "--out", fspath(out), *listed, *rows, *_option("--model", model)])
     with open(out, "rb") as file:
         entries = tomllib.load(file).get("effect", [])
     return Identification(effects=tuple(_entry(entry) for entry in entries), model=Path(out))
@@ -221,6 +233,11 @@ def _paths(logs: File | Sequence[File]) -> list[str]:
 
 def _option(flag: str, value: File | None) -> list[str]:
     return [] if value is None else [flag, fspath(value)]
+
+
+def _rows(from_s: float | None, until_s: float | None) -> list[str]:
+    limits = {"--from": from_s, "--until": until_s}
+    return [word for flag, time in limits.items() if time is not None for word in (flag, str(time))]
 
 
 def _errors(found: Mapping[str, Any]) -> ModelErrors:

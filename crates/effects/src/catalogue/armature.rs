@@ -1,8 +1,8 @@
 //! Rotor inertia reflected through the gear to the joint.
 
 use crate::{
-    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
-    Search, Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place,
+    PlotQuantity, Presence, Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -47,6 +47,13 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::Acceleration, PlotQuantity::InverseDynamicsResidual],
     },
     blind_test: Some(&[BlindTestCondition::FixedBase]),
+    laws: &[LawForm {
+        is_of_torque: true,
+        is_usual: true,
+        ..LawForm::positive(Place::Joint, &[0.02], |c, _| vec![c[0]])
+    }
+    .with_small(&[0.0015], Presence::Everywhere)],
+    amount: Some(|joint| joint.armature),
     apply: Apply::Joint(|joint, values| {
         joint.armature += values[0];
         Ok(())

@@ -1,8 +1,8 @@
 //! Backlash in the gear between rotor and link.
 
 use crate::{
-    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
-    Search, Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place,
+    PlotQuantity, Presence, Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -49,6 +49,8 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::Time, PlotQuantity::InverseDynamicsResidual],
     },
     blind_test: Some(&[BlindTestCondition::FixedBase]),
+    laws: &[LawForm::positive(Place::Link, &[0.01], |c, _| vec![c[0].max(0.0)]).with_small(&[0.002], Presence::Torques)],
+    amount: None,
     apply: Apply::Joint(|joint, values| {
         joint.actuator.backlash = values[0];
         Ok(())

@@ -3,8 +3,8 @@
 use glam::DVec3;
 
 use crate::{
-    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
-    Probes, Search, Target, Variable, Visibility, demo, probes_along_axes,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place,
+    PlotQuantity, Probes, Search, Target, Variable, Visibility, demo, probes_along_axes,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -50,6 +50,8 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::Time, PlotQuantity::FrontShare],
     },
     blind_test: Some(&[BlindTestCondition::FloatingBase]),
+    laws: &[LawForm { small: &[0.003; 3], ..LawForm::new(Place::Body, &[0.02; 3], |c, _| c.to_vec()) }],
+    amount: None,
     apply: Apply::Robot(|robot, site, values| {
         crate::body(robot, site).com += DVec3::new(values[0], values[1], values[2]);
         Ok(())

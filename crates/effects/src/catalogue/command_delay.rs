@@ -1,8 +1,8 @@
 //! Delay between a command and its arrival at the actuator.
 
 use crate::{
-    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
-    Search, Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place,
+    PlotQuantity, Presence, Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -53,6 +53,9 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::CommandedTorque, PlotQuantity::EstimatedTorque],
     },
     blind_test: Some(&[BlindTestCondition::FixedBase]),
+    laws: &[LawForm { is_usual: true, ..LawForm::strength(Place::Drive, |c, _| vec![0.02 * c[0].max(0.0)]) }
+        .with_small(&[0.005], Presence::Everywhere)],
+    amount: Some(|joint| joint.actuator.command_delay),
     apply: Apply::Joint(|joint, values| {
         joint.actuator.command_delay += values[0];
         Ok(())

@@ -1,8 +1,8 @@
 //! Dry friction, independent of speed, which also holds the joint at rest.
 
 use crate::{
-    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
-    Search, Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place,
+    PlotQuantity, Presence, Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -55,6 +55,13 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::Velocity, PlotQuantity::InverseDynamicsResidual],
     },
     blind_test: Some(&[BlindTestCondition::FixedBase]),
+    laws: &[LawForm {
+        is_of_torque: true,
+        is_usual: true,
+        ..LawForm::positive(Place::Joint, &[0.6], |c, _| vec![c[0]])
+    }
+    .with_small(&[0.05], Presence::Everywhere)],
+    amount: Some(|joint| joint.coulomb_friction),
     apply: Apply::Joint(|joint, values| {
         joint.coulomb_friction += values[0];
         Ok(())

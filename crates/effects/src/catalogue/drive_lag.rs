@@ -1,8 +1,8 @@
 //! The motor current follows its setpoint as a first-order lag.
 
 use crate::{
-    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
-    Search, Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place,
+    PlotQuantity, Presence, Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -51,6 +51,12 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::CommandedTorque, PlotQuantity::EstimatedTorque],
     },
     blind_test: Some(&[BlindTestCondition::FixedBase]),
+    laws: &[LawForm {
+        add: Some(|joint, unknown, _| joint.actuator.torque_time_constant += 0.015 * unknown),
+        ..LawForm::strength(Place::Drive, |c, _| vec![0.015 * c[0].max(0.0)])
+    }
+    .with_small(&[0.007], Presence::Everywhere)],
+    amount: None,
     apply: Apply::Joint(|joint, values| {
         joint.actuator.torque_time_constant = values[0];
         Ok(())

@@ -1,8 +1,8 @@
 //! The encoder zero is offset from the joint zero.
 
 use crate::{
-    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
-    Probes, Search, Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place,
+    PlotQuantity, Presence, Probes, Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -52,6 +52,8 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::Position, PlotQuantity::Height],
     },
     blind_test: Some(&[BlindTestCondition::FloatingBase]),
+    laws: &[LawForm::new(Place::Link, &[0.025], |c, _| vec![c[0]]).with_small(&[0.0015], Presence::Everywhere)],
+    amount: None,
     apply: Apply::Joint(|joint, values| {
         joint.actuator.encoder_offset += values[0];
         Ok(())

@@ -43,6 +43,8 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::Time, PlotQuantity::LateralAcceleration],
     },
     blind_test: None,
+    laws: &[],
+    amount: None,
     apply: Apply::Robot(|robot, _, values| {
         robot.contact.friction = values[0];
         Ok(())

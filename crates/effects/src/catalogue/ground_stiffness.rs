@@ -46,6 +46,8 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::Time, PlotQuantity::Force],
     },
     blind_test: Some(&[BlindTestCondition::FloatingBase]),
+    laws: &[],
+    amount: None,
     apply: Apply::Robot(|robot, _, values| {
         robot.contact.time_constant = values[0];
         Ok(())

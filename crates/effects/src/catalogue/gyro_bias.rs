@@ -3,8 +3,8 @@
 use glam::DVec3;
 
 use crate::{
-    Apply, BlindTestCondition, Composition, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Probes,
-    Search, Target, Variable, Visibility, demo, probes_along_axes,
+    Apply, BlindTestCondition, Composition, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place,
+    PlotQuantity, Probes, Search, Target, Variable, Visibility, demo, probes_along_axes,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -42,6 +42,8 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::RollRate, PlotQuantity::Gyro],
     },
     blind_test: Some(&[BlindTestCondition::FloatingBase]),
+    laws: &[LawForm::new(Place::Gyro, &[0.01; 3], |c, _| c.to_vec())],
+    amount: None,
     apply: Apply::Robot(|robot, _, values| {
         robot.gyro_bias += DVec3::new(values[0], values[1], values[2]);
         Ok(())

@@ -1,8 +1,8 @@
 //! Replaces all ten inertial parameters of a body.
 
 use crate::{
-    Apply, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Probes, Search,
-    Target, Variable, Visibility, demo,
+    Apply, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place, PlotQuantity,
+    Probes, Search, Target, Variable, Visibility, demo,
 };
 use twinstep_model::RigidBody;
 
@@ -47,6 +47,13 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::VerticalAcceleration, PlotQuantity::Force],
     },
     blind_test: None,
+    laws: &[LawForm {
+        // A second moment is the sum of two moments of inertia minus the third, half of it.
+        small: &[0.08; 3],
+        // Second moments along the axes of the body; the parameters of the effect depend on the body.
+        ..LawForm::new(Place::Body, &[0.4; 3], |c, _| c.to_vec())
+    }],
+    amount: None,
     apply: Apply::Robot(|robot, site, values| {
         let theta: [f64; 10] = values.try_into().expect("ten values");
         *crate::body(robot, site) = RigidBody::from_log_cholesky(&theta);

@@ -1,8 +1,8 @@
 //! Elastic gear between rotor and link.
 
 use crate::{
-    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
-    Search, Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place,
+    PlotQuantity, Presence, Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -47,6 +47,16 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::Time, PlotQuantity::InverseDynamicsResidual],
     },
     blind_test: Some(&[BlindTestCondition::FixedBase]),
+    laws: &[LawForm {
+        is_of_torque: true,
+        add: Some(|joint, unknown, scale| {
+            let compliance = 1.0 / joint.actuator.gear_stiffness + unknown / scale;
+            joint.actuator.gear_stiffness = 1.0 / compliance;
+        }),
+        ..LawForm::positive(Place::Link, &[0.0025], |c, _| vec![1.0 / c[0].max(1e-6)])
+    }
+    .with_small(&[2.5e-4], Presence::Torques)],
+    amount: None,
     apply: Apply::Joint(|joint, values| {
         joint.actuator.gear_stiffness = values[0];
         Ok(())

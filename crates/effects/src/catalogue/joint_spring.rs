@@ -1,8 +1,8 @@
 //! A cable or a spring pulls the joint towards a rest position.
 
 use crate::{
-    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
-    Probes, Search, Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place,
+    PlotQuantity, Presence, Probes, Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -58,6 +58,15 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::Position, PlotQuantity::InverseDynamicsResidual],
     },
     blind_test: Some(&[BlindTestCondition::FixedBase]),
+    laws: &[LawForm {
+        is_of_torque: true,
+        ..LawForm::new(Place::Joint, &[1.5, 1.0], |c, _| {
+            let stiffness = if c[0].abs() < 1e-6 { 1e-6 } else { c[0] };
+            vec![stiffness, c[1] / stiffness]
+        })
+    }
+    .with_small(&[0.05, 0.02], Presence::Torques)],
+    amount: None,
     apply: Apply::Joint(|joint, values| {
         let spring = &mut joint.spring;
         spring.stiffness += values[0];

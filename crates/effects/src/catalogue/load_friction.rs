@@ -1,8 +1,8 @@
 //! Friction proportional to the magnitude of the motor torque.
 
 use crate::{
-    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
-    Search, Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place,
+    PlotQuantity, Presence, Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -47,6 +47,8 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::EstimatedTorque, PlotQuantity::InverseDynamicsResidual],
     },
     blind_test: Some(&[BlindTestCondition::FloatingBase]),
+    laws: &[LawForm::positive(Place::Joint, &[0.12], |c, _| vec![c[0]]).with_small(&[0.005], Presence::Everywhere)],
+    amount: Some(|joint| joint.load_friction),
     apply: Apply::Joint(|joint, values| {
         joint.load_friction += values[0];
         Ok(())

@@ -3,8 +3,8 @@
 use glam::DVec3;
 
 use crate::{
-    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
-    Probes, Search, Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place,
+    PlotQuantity, Probes, Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -63,6 +63,11 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::VerticalAcceleration, PlotQuantity::Force],
     },
     blind_test: Some(&[BlindTestCondition::FloatingBase]),
+    laws: &[LawForm::new(Place::Body, &[2.0, 0.2, 0.2, 0.2], |c, _| {
+        let mass = if c[0].abs() < 1e-6 { 1e-6 } else { c[0] };
+        vec![mass, c[1] / mass, c[2] / mass, c[3] / mass]
+    })],
+    amount: None,
     apply: Apply::Robot(|robot, site, values| {
         let body = crate::body(robot, site);
         if body.mass + values[0] <= 0.0 {

@@ -1,8 +1,8 @@
 //! The gains of the PD loop differ from the commanded gains.
 
 use crate::{
-    Apply, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Probes, Search,
-    Target, Variable, Visibility, demo, probes_over,
+    Apply, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place, PlotQuantity,
+    Presence, Probes, Search, Target, Variable, Visibility, demo, probes_over,
 };
 
 /// Prior range of the factor on kp.
@@ -66,6 +66,15 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::CommandedTorque, PlotQuantity::EstimatedTorque],
     },
     blind_test: None,
+    laws: &[
+        LawForm { is_gain: true, ..LawForm::new(Place::Drive, &[0.15], |c, _| vec![1.0 + c[0], 1.0]) }
+            .with_small(&[0.02], Presence::Nowhere),
+        LawForm { is_gain: true, ..LawForm::new(Place::Drive, &[0.3], |c, _| vec![1.0, 1.0 + c[0]]) }
+            .with_small(&[0.04], Presence::Nowhere),
+        LawForm { is_gain: true, ..LawForm::new(Place::Drive, &[0.15, 0.3], |c, _| vec![1.0 + c[0], 1.0 + c[1]]) }
+            .with_small(&[0.02, 0.04], Presence::Everywhere),
+    ],
+    amount: None,
     apply: Apply::Joint(|joint, values| {
         let actuator = &mut joint.actuator;
         actuator.kp_scale *= values[0];

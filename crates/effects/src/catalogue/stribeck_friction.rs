@@ -1,8 +1,8 @@
 //! Additional friction near standstill that decays with speed.
 
 use crate::{
-    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
-    Probes, Search, Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place,
+    PlotQuantity, Probes, Search, Shapes, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -50,6 +50,13 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::Velocity, PlotQuantity::InverseDynamicsResidual],
     },
     blind_test: Some(&[BlindTestCondition::FixedBase]),
+    laws: &[LawForm {
+        is_of_torque: true,
+        shapes: Shapes::Values(&[0.1, 0.2, 0.4, 0.8, 1.5, 3.0]),
+        small: &[0.04],
+        ..LawForm::positive(Place::Joint, &[0.5], |c, speed| vec![c[0], speed])
+    }],
+    amount: None,
     apply: Apply::Joint(|joint, values| {
         let friction = &mut joint.stribeck_friction;
         if friction.breakaway_torque > 0.0 && (friction.stribeck_velocity - values[1]).abs() > 1e-9 {

@@ -1,8 +1,8 @@
 //! Motor torque decreases with the battery voltage.
 
 use crate::{
-    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
-    Search, Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place,
+    PlotQuantity, Presence, Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -47,6 +47,8 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::Voltage, PlotQuantity::DeratingFactor],
     },
     blind_test: Some(&[BlindTestCondition::Voltage]),
+    laws: &[LawForm::strength(Place::Supply, |c, _| vec![2.0 * c[0].max(0.0)]).with_small(&[0.01], Presence::Torques)],
+    amount: None,
     apply: Apply::Robot(|robot, _, values| {
         robot.derating.voltage_exponent = values[0];
         Ok(())

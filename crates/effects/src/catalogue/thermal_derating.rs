@@ -1,8 +1,8 @@
 //! Motor torque decreases with the motor temperature.
 
 use crate::{
-    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, EffectSite, Parameter,
-    PlotQuantity, Probes, Search, Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, EffectSite, LawForm,
+    Parameter, Place, PlotQuantity, Probes, Search, Shapes, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -57,6 +57,11 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::Temperature, PlotQuantity::DeratingFactor],
     },
     blind_test: Some(&[BlindTestCondition::Temperature, BlindTestCondition::FixedBase]),
+    laws: &[LawForm {
+        shapes: Shapes::Range([25.0, 45.0, 2.5]),
+        ..LawForm::positive(Place::Drive, &[0.0025], |c, above| vec![c[0].max(0.0), above])
+    }],
+    amount: None,
     apply: Apply::Robot(|robot, site, values| {
         if let EffectSite::Joint(index) = site {
             robot.derating.per_kelvin[index] = values[0];

@@ -1,8 +1,8 @@
 //! The motor produces no torque for small commanded torques.
 
 use crate::{
-    Apply, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Search, Target,
-    Variable, Visibility, demo,
+    Apply, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place, PlotQuantity,
+    Presence, Search, Target, Variable, Visibility, demo,
 };
 
 /// The motor produces no torque for small commanded torques.
@@ -50,6 +50,13 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::CommandedTorque, PlotQuantity::EstimatedTorque],
     },
     blind_test: None,
+    laws: &[LawForm {
+        is_of_torque: true,
+        add: Some(|joint, unknown, scale| joint.actuator.dead_zone += 1.5 * scale * unknown),
+        ..LawForm::strength(Place::Drive, |c, _| vec![1.5 * c[0].max(0.0)])
+    }
+    .with_small(&[0.007], Presence::Torques)],
+    amount: None,
     apply: Apply::Joint(|joint, values| {
         joint.actuator.dead_zone = values[0];
         Ok(())

@@ -1,8 +1,8 @@
 //! Delay of the torque that the PD loop computes.
 
 use crate::{
-    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
-    Search, Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place,
+    PlotQuantity, Presence, Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -51,6 +51,8 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::CommandedTorque, PlotQuantity::EstimatedTorque],
     },
     blind_test: Some(&[BlindTestCondition::FixedBase]),
+    laws: &[LawForm::strength(Place::Drive, |c, _| vec![0.01 * c[0].max(0.0)]).with_small(&[0.01], Presence::Torques)],
+    amount: None,
     apply: Apply::Joint(|joint, values| {
         joint.actuator.torque_delay += values[0];
         Ok(())

@@ -1,8 +1,8 @@
 //! The torque constant differs from the one that converts motor current to torque.
 
 use crate::{
-    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
-    Search, Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place,
+    PlotQuantity, Presence, Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -50,6 +50,8 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::EstimatedTorque, PlotQuantity::InverseDynamicsResidual],
     },
     blind_test: Some(&[BlindTestCondition::FixedBase]),
+    laws: &[LawForm::new(Place::Joint, &[0.1], |c, _| vec![1.0 + c[0]]).with_small(&[0.01], Presence::Torques)],
+    amount: None,
     apply: Apply::Joint(|joint, values| {
         joint.actuator.gain *= values[0];
         Ok(())

@@ -1,10 +1,11 @@
 //! Motor torque ripple that depends on the joint position.
 
-use crate::{
-    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
-    Probes, Search, Target, Variable, Visibility, demo,
-};
 use std::f64::consts::PI;
+
+use crate::{
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place,
+    PlotQuantity, Probes, Search, Shapes, Target, Variable, Visibility, demo,
+};
 use twinstep_model::Ripple;
 
 pub const EFFECT: Effect = Effect {
@@ -62,6 +63,16 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::Position, PlotQuantity::InverseDynamicsResidual],
     },
     blind_test: Some(&[BlindTestCondition::FixedBase]),
+    laws: &[LawForm {
+        is_of_torque: true,
+        shapes: Shapes::Range([6.0, 150.0, 1.5]),
+        // Cogging of 0.1 % of the peak torque, in phase and out of phase.
+        small: &[0.02, 0.02],
+        ..LawForm::new(Place::Joint, &[0.2, 0.2], |c, cycles| {
+            vec![c[0].hypot(c[1]), cycles, c[1].atan2(c[0]).clamp(-PI, PI)]
+        })
+    }],
+    amount: None,
     apply: Apply::Joint(|joint, values| {
         let ripple = &mut joint.actuator.ripple;
         let [amplitude, cycles, phase] = [values[0], values[1], values[2]];

@@ -1,8 +1,8 @@
 //! Smooth saturation of the motor torque.
 
 use crate::{
-    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
-    Search, Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place,
+    PlotQuantity, Presence, Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -50,6 +50,16 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::CommandedTorque, PlotQuantity::EstimatedTorque],
     },
     blind_test: Some(&[BlindTestCondition::FixedBase]),
+    laws: &[LawForm {
+        is_of_torque: true,
+        add: Some(|joint, unknown, scale| {
+            let saturation = &mut joint.actuator.saturation;
+            *saturation = 1.0 / (1.0 / *saturation + unknown / (15.0 * scale));
+        }),
+        ..LawForm::strength(Place::Drive, |c, _| vec![15.0 / c[0].max(1e-3)])
+    }
+    .with_small(&[0.03], Presence::Torques)],
+    amount: None,
     apply: Apply::Joint(|joint, values| {
         joint.actuator.saturation = values[0];
         Ok(())

@@ -1,8 +1,8 @@
 //! Delay of the logged torque; the motion is not delayed.
 
 use crate::{
-    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
-    Search, Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place,
+    PlotQuantity, Presence, Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -39,6 +39,8 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::CommandedTorque, PlotQuantity::EstimatedTorque],
     },
     blind_test: Some(&[BlindTestCondition::Torque, BlindTestCondition::FixedBase]),
+    laws: &[LawForm::strength(Place::Sensor, |c, _| vec![0.02 * c[0].max(0.0)]).with_small(&[0.005], Presence::Torques)],
+    amount: None,
     apply: Apply::Joint(|joint, values| {
         joint.actuator.sensor_delay += values[0];
         Ok(())

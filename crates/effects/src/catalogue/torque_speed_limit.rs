@@ -1,8 +1,8 @@
 //! Back-EMF reduces the available torque with speed.
 
 use crate::{
-    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
-    Search, Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place,
+    PlotQuantity, Presence, Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -45,6 +45,15 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::Velocity, PlotQuantity::EstimatedTorque],
     },
     blind_test: Some(&[BlindTestCondition::FixedBase]),
+    laws: &[LawForm {
+        add: Some(|joint, unknown, _| {
+            let speed = &mut joint.actuator.no_load_speed;
+            *speed = 1.0 / (1.0 / *speed + unknown / 12.0);
+        }),
+        ..LawForm::strength(Place::Drive, |c, _| vec![12.0 / c[0].max(1e-3)])
+    }
+    .with_small(&[0.05], Presence::Torques)],
+    amount: None,
     apply: Apply::Joint(|joint, values| {
         joint.actuator.no_load_speed = values[0];
         Ok(())

@@ -1,8 +1,8 @@
 //! Friction proportional to the joint velocity.
 
 use crate::{
-    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
-    Search, Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place,
+    PlotQuantity, Presence, Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -45,6 +45,13 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::Velocity, PlotQuantity::InverseDynamicsResidual],
     },
     blind_test: Some(&[BlindTestCondition::FixedBase]),
+    laws: &[LawForm {
+        is_of_torque: true,
+        is_usual: true,
+        ..LawForm::positive(Place::Joint, &[0.25], |c, _| vec![c[0]])
+    }
+    .with_small(&[0.025], Presence::Everywhere)],
+    amount: Some(|joint| joint.viscous_friction),
     apply: Apply::Joint(|joint, values| {
         joint.viscous_friction += values[0];
         Ok(())

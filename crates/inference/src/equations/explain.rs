@@ -89,8 +89,8 @@ fn explain_robot(
         }
         let is_balanced = hangs && !system.balance.samples.is_empty();
         for law in laws.iter_mut().filter(|_| !is_balanced) {
-            let is_of_joint = law.place == Place::Joint && system.measured.is_at_output;
-            law.is_cause &= matches!(law.place, Place::Drive | Place::Supply) || is_of_joint;
+            let is_of_joint = law.form.place == Place::Joint && system.measured.is_at_output;
+            law.is_cause &= matches!(law.form.place, Place::Drive | Place::Supply) || is_of_joint;
         }
         Search::new(&system, &laws, scopes, robot.clone()).run(go_on)
     } else {

@@ -120,7 +120,7 @@ impl Terms<'_> {
         let intervals = self.intervals(law, first, (&cause.mean(), &found.stds), cause.shape, mean_scale);
         let sites = cause.scope.sites.iter().zip(cause.values.iter().zip(&found.site_stds));
         let differs = differ(cause, found)
-            || law.is_of_torque && cause.scope.sites.iter().any(|site| self.scale(*site) != self.scale(first));
+            || law.form.is_of_torque && cause.scope.sites.iter().any(|site| self.scale(*site) != self.scale(first));
         let by_joint = sites.filter_map(|(site, (unknowns, stds))| match site {
             Site::Joint(joint) if differs => {
                 Some(self.of_joint(law, *joint, (unknowns.as_slice(), stds.as_slice()), cause.shape))
@@ -189,7 +189,7 @@ impl Terms<'_> {
 
     /// Returns the parameters of an effect within their bounds.
     fn values(&self, law: &Law, site: Site, unknowns: &[f64], shape: f64, scale: f64) -> Vec<f64> {
-        if law.effect.name != "inertia" {
+        if !law.effect.replaces_body() {
             return clamped(law.effect, law.parameters(unknowns, shape, scale));
         }
         let mut changed = self.robot.clone();

@@ -11,7 +11,7 @@ use super::normal;
 use super::problem::Search;
 use super::residuals::{Change, Residuals, Small};
 use super::robot::Robot;
-use super::site::{apply, least};
+use super::site::{apply, is_physical, least};
 
 /// Change of an unknown, in its unit, below which a fit has converged.
 const CONVERGED: f64 = 0.02;
@@ -85,7 +85,12 @@ impl<R: Residuals> Search<'_, R> {
             iteration += 1;
             let has_converged = if is_nonlinear { next.is_none() } else { largest < CONVERGED };
             if iteration >= iterations.max(1) || has_converged {
-                let is_allowed = |cause: &Cause| self.laws[cause.law].allows(&cause.mean(), cause.shape);
+                let is_allowed = |cause: &Cause| {
+                    let law = &self.laws[cause.law];
+                    let mut sites = cause.scope.sites.iter().zip(&cause.values);
+                    law.allows(&cause.mean(), cause.shape)
+                        && sites.all(|(site, values)| is_physical(&self.base, law, *site, values))
+                };
                 let is_possible = moved.iter().all(is_allowed);
                 let log_prior: f64 = causes.iter().map(|cause| cause.log_prior).sum();
                 let evidence = posterior.evidence + log_prior + log_allowed;
@@ -135,14 +140,14 @@ impl<R: Residuals> Search<'_, R> {
         for cause in &mut moved {
             let law = &self.laws[cause.law];
             let least: Vec<f64> = cause.scope.sites.iter().map(|site| least(law, &self.base, *site)).collect();
-            if law.is_positive {
-                log_allowed += log_allowed_of(cause, &least, law.units[0], place, posterior);
+            if law.form.is_positive {
+                log_allowed += log_allowed_of(cause, &least, law.form.units[0], place, posterior);
             }
             for (values, least) in cause.values.iter_mut().zip(least) {
                 for (unknown, value) in values.iter_mut().enumerate() {
                     let shift = posterior.mean[place];
                     place += 1;
-                    largest = largest.max(shift.abs() / law.units[unknown]);
+                    largest = largest.max(shift.abs() / law.form.units[unknown]);
                     *value += share * shift;
                     if unknown == 0 {
                         *value = law.possible(*value, least);
@@ -227,7 +232,7 @@ impl<R: Residuals> Search<'_, R> {
 
     /// Returns the unknowns of each cause: how its values differ from those of the robot.
     fn groups(&self, causes: &[Cause], small: &[f64], robot: &Robot, predicted: &R::Predicted) -> Vec<Group> {
-        let step = |cause: usize, unknown: usize| 0.04 * self.laws[causes[cause].law].units[unknown];
+        let step = |cause: usize, unknown: usize| 0.04 * self.laws[causes[cause].law].form.units[unknown];
         let mut places = Vec::new();
         for (cause, one) in causes.iter().enumerate() {
             let unknowns = one.values[0].len();
@@ -250,7 +255,7 @@ impl<R: Residuals> Search<'_, R> {
             .map(|(column, (cause, _, unknown))| column.scaled(1.0 / step(*cause, *unknown)));
         let mut columns = scaled.collect::<Vec<_>>().into_iter();
         let group = |cause: &Cause| {
-            let units = &self.laws[cause.law].units;
+            let units = &self.laws[cause.law].form.units;
             let (sites, size) = (cause.values.len(), units.len());
             let columns = columns.by_ref().take(sites * size).collect();
             let mean = DVector::from_iterator(sites * size, cause.values.iter().flatten().map(|value| -value));

@@ -51,17 +51,17 @@ impl<R: Residuals> Search<'_, R> {
         };
         let joints: Vec<usize> = cause.scope.sites.iter().filter_map(joint_of).collect();
         let without = self.fit(others, &best.small, 2, Some(best));
-        if joints.is_empty() || law.place == Place::Body {
+        if joints.is_empty() || law.form.place == Place::Body {
             return (without, None);
         }
         let functions = |predicted: &R::Predicted, joint: usize| -> Vec<Column> {
-            self.system.functions(predicted, joint, law.place).into_iter().map(|(_, column)| column).collect()
+            self.system.functions(predicted, joint, law.form.place).into_iter().map(|(_, column)| column).collect()
         };
         let free = joints.iter().map(|joint| Group::independent(functions(&without.predicted, *joint), unknown::STD));
         let imitated =
             Self::evidence_with(&without, best, free.collect()) + (EFFECT_PROBABILITY * cause.scope.probability).ln();
         // A law of the catalogue may have a slightly different form.
-        let unknowns = law.units.len();
+        let unknowns = law.form.units.len();
         let near = joints.iter().enumerate().flat_map(|(site, joint)| {
             let columns = &best.groups[place].columns[site * unknowns..(site + 1) * unknowns];
             let size = root_mean_square(&sum(columns, &cause.values[site]));
@@ -78,7 +78,7 @@ impl<R: Residuals> Search<'_, R> {
     /// Returns by how much the law of a cause is better with a size that changes with the state: nothing of the catalogue does that.
     pub fn gain_of_changes(&self, best: &Fitted<R>, place: usize) -> f64 {
         let cause = &best.causes[place];
-        let unknowns = self.laws[cause.law].units.len();
+        let unknowns = self.laws[cause.law].form.units.len();
         let mut changes = vec![Column::default(); MODULATORS.len()];
         for (index, site) in cause.scope.sites.iter().enumerate() {
             let columns = &best.groups[place].columns[index * unknowns..(index + 1) * unknowns];

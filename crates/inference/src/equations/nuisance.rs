@@ -6,38 +6,13 @@ use twinstep_model::RigidBody;
 
 use super::block::Column;
 use super::gaussian::Group;
-use super::law::Law;
+use super::law::{Law, Place, Presence};
 use super::robot::Robot;
 use super::site::{Site, apply};
 use super::system::{Predicted, System};
 
-/// Standard deviation of an effect's first unknowns where it is too small to be reported: name and values in its unit.
-///
-/// Assumed: equal motors differ by a few per cent of their gains and of the torque that they have in slow motion, and delays by a fraction
-/// of a period of a field bus. What twice or half of these numbers changes in the rates was not examined.
-const SMALL: [(&str, &[f64]); 15] = [
-    ("command_delay", &[0.005]),
-    ("pd_gain", &[0.02, 0.04]),
-    ("supply_sag", &[0.01]),
-    ("torque_saturation", &[0.03]),
-    ("torque_speed_limit", &[0.05]),
-    ("torque_delay", &[0.01]),
-    ("torque_dead_zone", &[0.007]),
-    ("drive_lag", &[0.007]),
-    ("torque_sensor_delay", &[0.005]),
-    ("torque_gain", &[0.01]),
-    ("coulomb_friction", &[0.05]),
-    ("viscous_friction", &[0.025]),
-    ("load_friction", &[0.005]),
-    ("armature", &[0.0015]),
-    ("joint_spring", &[0.05, 0.02]),
-];
-/// The same for effects on the motion of a link.
-const SMALL_MOTION: [(&str, f64); 3] = [("encoder_offset", 0.0015), ("joint_elasticity", 2.5e-4), ("backlash", 0.002)];
 /// Standard deviation of the friction at low speed [N·m], for two speeds [rad/s].
 const LOW_SPEED: [(f64, f64); 2] = [(0.04, 0.2), (0.03, 0.8)];
-/// Standard deviation of the amplitude of a torque ripple, in phase and out of phase [N·m]: cogging of 0.1 % of the peak torque.
-const RIPPLE: f64 = 0.02;
 /// Standard deviation of the time by which the positions of an encoder are ahead of its velocities [s]: drives filter the velocity, and
 /// simulators update positions with the new one.
 const LEAD: f64 = 4e-4;
@@ -60,10 +35,9 @@ const LEAST_SEEN: f64 = 0.1;
 /// Returns the small unknowns whose columns depend on the causes that were found: those of drives and joints.
 pub fn of_joints(system: &System, laws: &[Law], robot: &Robot, predicted: &Predicted) -> Vec<Group> {
     let (mut small, mut gains) = (Vec::new(), Vec::new());
-    for (name, stds) in SMALL {
-        let law = named(laws, name);
-        for (unknown, std) in stds.iter().enumerate() {
-            if name == "pd_gain" {
+    for law in present(laws, &[Place::Drive, Place::Supply, Place::Sensor, Place::Joint]) {
+        for (unknown, std) in law.form.small.iter().enumerate() {
+            if law.form.is_gain {
                 let columns = by_joint(system, law, robot, predicted, unknown, law.shapes[0], *std);
                 let group = |(column, std)| Group { gain: Some(unknown), ..Group::single(column, std) };
                 gains.extend(columns.into_iter().map(group));
@@ -86,8 +60,8 @@ pub fn of_joints(system: &System, laws: &[Law], robot: &Robot, predicted: &Predi
 /// Returns the small unknowns whose columns do not depend on the causes: those of bodies and their motion.
 pub fn of_bodies(system: &System, laws: &[Law], robot: &Robot, predicted: &Predicted) -> Vec<Group> {
     let mut small = bodies(system, robot);
-    for (name, std) in SMALL_MOTION {
-        small.extend(by_joint(system, named(laws, name), robot, predicted, 0, 0.0, std));
+    for law in present(laws, &[Place::Link]) {
+        small.extend(by_joint(system, law, robot, predicted, 0, 0.0, law.small_std(0)));
     }
     small.extend((0..robot.joints.len()).map(|joint| (system.balance.lead_column(joint), LEAD)));
     small.extend([0, 1].map(|axis| (system.balance.tilt_column(axis), TILT)));
@@ -96,24 +70,14 @@ pub fn of_bodies(system: &System, laws: &[Law], robot: &Robot, predicted: &Predi
     grouped(system, small)
 }
 
-/// Returns the standard deviation of an unknown of an effect that is too small to be reported.
-pub fn small_std(effect: &str, unknown: usize) -> f64 {
-    let of_joint = SMALL.iter().find(|(name, _)| *name == effect).and_then(|(_, stds)| stds.get(unknown).copied());
-    let of_motion = SMALL_MOTION.iter().find(|(name, _)| *name == effect).map(|(_, std)| *std);
-    let of_others = match effect {
-        "stribeck_friction" => LOW_SPEED[0].0,
-        "torque_ripple" => RIPPLE,
-        "com_shift" => BODY[2],
-        // A second moment is the sum of two moments of inertia minus the third, half of it.
-        "inertia" => 2.0 * BODY[1],
-        _ => 0.0,
-    };
-    of_joint.or(of_motion).unwrap_or(of_others)
+/// Returns the laws at these places of which every joint has a little.
+fn present<'a>(laws: &'a [Law], places: &'a [Place]) -> impl Iterator<Item = &'a Law> {
+    laws.iter().filter(|law| law.form.little != Presence::Nowhere && places.contains(&law.form.place))
 }
 
 fn named<'a>(laws: &'a [Law], name: &str) -> &'a Law {
     let own = laws.iter().filter(|law| law.effect.name == name);
-    own.max_by_key(|law| law.units.len()).expect("a law of each effect")
+    own.max_by_key(|law| law.form.units.len()).expect("a law of each effect")
 }
 
 /// Returns unknowns of their own, without the equations in which they are much smaller than the noise.
@@ -140,7 +104,7 @@ fn by_joint(
     std: f64,
 ) -> Vec<(Column, f64)> {
     let column = |joint: usize| {
-        let mut unknowns = vec![0.0; law.units.len()];
+        let mut unknowns = vec![0.0; law.form.units.len()];
         unknowns[unknown] = 2.0 * std;
         let mut before = robot.clone();
         if law.effect.name == "stribeck_friction" {
@@ -158,18 +122,10 @@ fn by_joint(
 /// Adds a small effect to what a joint has of it already.
 pub fn add(robot: &mut Robot, law: &Law, joint: usize, unknowns: &[f64], shape: f64) {
     let scale = robot.scale[joint];
-    let actuator = &mut robot.joints[joint].actuator;
-    match law.effect.name {
-        "torque_dead_zone" => actuator.dead_zone += 1.5 * scale * unknowns[0],
-        "drive_lag" => actuator.torque_time_constant += 0.015 * unknowns[0],
-        "torque_saturation" => actuator.saturation = 1.0 / (1.0 / actuator.saturation + unknowns[0] / (15.0 * scale)),
-        "torque_speed_limit" => actuator.no_load_speed = 1.0 / (1.0 / actuator.no_load_speed + unknowns[0] / 12.0),
-        "joint_elasticity" => {
-            let compliance = 1.0 / actuator.gear_stiffness + unknowns[0] / scale;
-            actuator.gear_stiffness = 1.0 / compliance;
-        }
-        "supply_sag" => robot.voltage_exponent += 2.0 * unknowns[0],
-        _ => apply(robot, law, Site::Joint(joint), unknowns, shape),
+    match (law.form.add, law.form.place) {
+        (Some(add), _) => add(&mut robot.joints[joint], unknowns[0], scale),
+        (None, Place::Supply) => robot.voltage_exponent += law.parameters(unknowns, shape, scale)[0],
+        (None, _) => apply(robot, law, Site::Joint(joint), unknowns, shape),
     }
 }
 

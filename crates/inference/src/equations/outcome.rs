@@ -11,7 +11,7 @@ use super::gaussian::{Group, Scores, gain};
 use super::law::Place;
 use super::problem::{Rivals, Search, UNKNOWN_PROBABILITY, power};
 use super::residuals::Residuals;
-use super::{nuisance, unknown};
+use super::unknown;
 
 /// Gain from which a law that the catalogue does not have is reported [nat].
 const LEAST_UNKNOWN: f64 = 10.0;
@@ -110,7 +110,7 @@ impl<R: Residuals> Search<'_, R> {
     /// Everything is a little present in every robot, so evidence alone does not make a cause.
     fn is_large(&self, found: &FoundCause) -> bool {
         let FoundCause { cause, stds, site_stds, .. } = found;
-        let effect = self.laws[cause.law].effect.name;
+        let law = &self.laws[cause.law];
         let root_mean_square = |of: &dyn Fn(usize) -> f64| {
             ((0..cause.values.len()).map(|site| of(site).powi(2)).sum::<f64>() / cause.values.len() as f64).sqrt()
         };
@@ -122,7 +122,7 @@ impl<R: Residuals> Search<'_, R> {
                 let size = root_mean_square(&|site| cause.values[site][unknown]);
                 [size, root_mean_square(&|site| site_stds[site][unknown])]
             };
-            size - TWO_SIDED_95 * nuisance::small_std(effect, unknown) > ONE_SIDED_95 * std
+            size - TWO_SIDED_95 * law.small_std(unknown) > ONE_SIDED_95 * std
         };
         cause.mean().iter().enumerate().any(exceeds)
     }

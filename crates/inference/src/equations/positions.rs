@@ -6,6 +6,7 @@
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
+use twinstep_effects::{CATALOGUE, Effect};
 use twinstep_logs::Log;
 use twinstep_model::{CONTACT, JointModel, RobotTree, TreeModel};
 
@@ -57,9 +58,6 @@ pub struct Drives {
     /// Ends simulations when it is true: what they would have is then missing.
     pub stop: Arc<AtomicBool>,
 }
-
-/// Returns a parameter of a joint.
-type Parameter = fn(&JointModel) -> f64;
 
 /// Simulation of a robot, by window.
 pub struct Simulated(Option<Vec<Trace>>);
@@ -185,17 +183,12 @@ impl Residuals for Positions {
     type Predicted = Simulated;
 
     fn usual(&self) -> Vec<(&'static str, Option<Vec<f64>>)> {
-        let estimates: [(&str, Parameter); 4] = [
-            ("coulomb_friction", |joint| joint.coulomb_friction),
-            ("viscous_friction", |joint| joint.viscous_friction),
-            ("armature", |joint| joint.armature),
-            ("command_delay", |joint| joint.actuator.command_delay),
-        ];
-        let start = |of: Parameter| {
+        let usual = CATALOGUE.into_iter().filter(|effect| effect.laws.iter().any(|form| form.is_usual));
+        let start = |effect: &Effect| {
             let pairs = self.drives.estimates.as_ref()?.iter().zip(&self.given);
-            Some(pairs.map(|(now, before)| of(now) - of(before)).collect())
+            Some(pairs.map(|(now, before)| effect.amount(now) - effect.amount(before)).collect())
         };
-        estimates.map(|(name, of)| (name, start(of))).to_vec()
+        usual.map(|effect| (effect.name, start(effect))).collect()
     }
 
     fn is_simulated(&self) -> bool {
@@ -251,7 +244,7 @@ impl Residuals for Positions {
         let columns = self.columns_of((robot, predicted), &robots);
         let group = |(column, small): (&Column, &SmallUnknown)| {
             let gain = match small.change {
-                SmallChange::OfLaw { law, unknown, .. } if laws[law].effect.name == "pd_gain" => Some(unknown),
+                SmallChange::OfLaw { law, unknown, .. } if laws[law].form.is_gain => Some(unknown),
                 _ => None,
             };
             Group { gain, ..Group::single(column.scaled(1.0 / small.std), small.std) }
@@ -335,5 +328,6 @@ fn compared_rows(log: &JointLog, joint: usize, windows: &[Window]) -> Vec<(usize
 
 /// Returns true if a law changes simulated positions.
 pub fn is_simulated(law: &Law) -> bool {
-    !matches!(law.place, Place::Supply | Place::Sensor | Place::Gyro) && law.effect.name != "thermal_derating"
+    // Voltage and temperature are not simulated.
+    !matches!(law.form.place, Place::Sensor | Place::Gyro) && law.effect.search.predictable
 }

@@ -2,7 +2,6 @@
 
 use super::causes::{Cause, ScopeSites};
 use super::fit::Fitted;
-use super::nuisance;
 use super::outcome::TWO_SIDED_95;
 use super::problem::{Rivals, Search};
 use super::residuals::Residuals;
@@ -21,13 +20,11 @@ impl<R: Residuals> Search<'_, R> {
     pub fn with_best_scope(&mut self, mut best: Fitted<R>, last: usize) -> Fitted<R> {
         let cause = best.causes[last].clone();
         let law = &self.laws[cause.law];
-        let sizes = cause.sizes(&law.units);
+        let sizes = cause.sizes(law.form.units);
         let largest = sizes.iter().copied().fold(0.0, f64::max);
         // A little of an effect is at every joint.
         let usual = |values: &Vec<f64>| {
-            let is_usual = |(unknown, value): (usize, &f64)| {
-                value.abs() < TWO_SIDED_95 * nuisance::small_std(law.effect.name, unknown)
-            };
+            let is_usual = |(unknown, value): (usize, &f64)| value.abs() < TWO_SIDED_95 * law.small_std(unknown);
             values.iter().enumerate().all(is_usual)
         };
         let is_large = |place: &usize| sizes[*place] > LARGE * largest && !usual(&cause.values[*place]);
@@ -41,7 +38,7 @@ impl<R: Residuals> Search<'_, R> {
             .cloned()
             .collect();
         scopes.sort_by_key(|scope| scope.sites.len());
-        let mean: Vec<f64> = (0..law.units.len())
+        let mean: Vec<f64> = (0..law.form.units.len())
             .map(|unknown| {
                 let of = |site: &Site| {
                     cause.values[cause.scope.sites.iter().position(|own| own == site).expect("a site")][unknown]
@@ -60,7 +57,8 @@ impl<R: Residuals> Search<'_, R> {
             let mut causes = best.causes.clone();
             causes[last] = Cause { scope, values, log_prior, ..cause.clone() };
             let other = self.fit(causes, &best.small, self.system.fit_steps(), Some(&best));
-            let is_scope = other.causes[last].scope.is_alike || other.causes[last].smallest_share(&law.units) > PRESENT;
+            let is_scope =
+                other.causes[last].scope.is_alike || other.causes[last].smallest_share(law.form.units) > PRESENT;
             if is_scope && other.is_possible && other.evidence > best.evidence {
                 let line =
                     format!("  scope {}: {:.1} nat", other.causes[last].scope.label(), other.evidence - best.evidence);

@@ -92,14 +92,14 @@ impl<R: Residuals> Search<'_, R> {
             sites.dedup();
             for site in sites {
                 for variant in 0..self.variants(index) {
-                    all.extend((0..law.units.len()).map(|unknown| (index, variant, site, unknown)));
+                    all.extend((0..law.form.units.len()).map(|unknown| (index, variant, site, unknown)));
                 }
             }
         }
         let unknowns_of = |(index, variant, _, unknown): &(usize, usize, Site, usize)| {
             let law = &self.laws[*index];
-            let mut unknowns = vec![0.0; law.units.len()];
-            unknowns[*unknown] = law.strengths.get(*variant).copied().unwrap_or(0.5 * law.units[*unknown]);
+            let mut unknowns = vec![0.0; law.form.units.len()];
+            unknowns[*unknown] = law.strengths.get(*variant).copied().unwrap_or(0.5 * law.form.units[*unknown]);
             unknowns
         };
         let change = |one: &(usize, usize, Site, usize)| {
@@ -170,7 +170,7 @@ impl<R: Residuals> Search<'_, R> {
                 if one.unknown != other.unknown {
                     return 0.0;
                 }
-                let unit = if is_strength { CELL } else { law.units[one.unknown] };
+                let unit = if is_strength { CELL } else { law.form.units[one.unknown] };
                 unit * unit * scope.covariance(one.site == other.site)
             });
             let (gain, posterior, spread) = gain(&with_residual, &inner, &mean, &covariance);
@@ -178,9 +178,9 @@ impl<R: Residuals> Search<'_, R> {
             let log_prior = self.log_prior(law_index, scope);
             let mut log_grid = -variants.ln();
             let least = |site: Site| least(law, &self.base, site);
-            if law.is_positive {
+            if law.form.is_positive {
                 // Posterior and prior are relative to a strength that is tried.
-                let prior = if is_strength { 1.0 } else { law.units[0] };
+                let prior = if is_strength { 1.0 } else { law.form.units[0] };
                 let bound = |row: usize| least(candidates[own[members[row]]].site);
                 let first = (0..size).filter(|row| candidates[own[members[*row]]].unknown == 0);
                 log_grid += if scope.is_alike {
@@ -195,7 +195,7 @@ impl<R: Residuals> Search<'_, R> {
                         .sum()
                 };
             }
-            let mut values = vec![vec![0.0; law.units.len()]; scope.sites.len()];
+            let mut values = vec![vec![0.0; law.form.units.len()]; scope.sites.len()];
             for (row, member) in members.iter().enumerate() {
                 let candidate = &candidates[own[*member]];
                 let site = scope.sites.iter().position(|site| *site == candidate.site).expect("a site of the scope");
@@ -209,7 +209,7 @@ impl<R: Residuals> Search<'_, R> {
             let cause =
                 Cause { law: law_index, scope: scope.clone(), shape, values, log_prior: log_prior + log_shapes };
             // Joints of which some have nothing are another scope.
-            let is_scope = cause.scope.is_alike || cause.smallest_share(&law.units) > PRESENT;
+            let is_scope = cause.scope.is_alike || cause.smallest_share(law.form.units) > PRESENT;
             if is_scope && law.allows(&cause.mean(), shape) {
                 found.push((gain + log_prior + log_grid, cause));
             }

@@ -158,7 +158,7 @@ impl<R: Residuals> Search<'_, R> {
                     let one = law.parameters(&[1.0], shape, self.base.scale[*joint])[0];
                     law.possible(start[*joint] / one, least(site))
                 }
-                _ => 0.1 * law.units[0],
+                _ => 0.1 * law.form.units[0],
             };
             let values = scope.sites.iter().map(|site| vec![value(site)]).collect();
             let log_prior = self.log_prior(index, &scope) - (law.strengths.len().max(1) as f64).ln();

@@ -9,6 +9,8 @@ use super::robot::Robot;
 /// Mass above which a payload changes the inertia of a body, too [kg], if it is no farther from the body's origin than this [m].
 const LEAST_PAYLOAD: f64 = 0.05;
 const LONGEST_ARM: f64 = 0.5;
+/// Largest part of a body's mass that a payload may take away.
+const LARGEST_LOSS: f64 = 0.9;
 /// Least factor on the second moment of a body along an axis.
 const LEAST_MOMENT: f64 = 0.1;
 
@@ -35,7 +37,7 @@ pub fn apply(robot: &mut Robot, law: &Law, site: Site, unknowns: &[f64], shape: 
         ("payload", site) => {
             // The unknowns are mass and first moment, in which forces are nearly linear.
             let body = &mut robot.tree.bodies[body_of(site)].inertia;
-            let mass = unknowns[0].max(-0.9 * body.mass);
+            let mass = unknowns[0].max(-LARGEST_LOSS * body.mass);
             let moment = DVec3::new(unknowns[1], unknowns[2], unknowns[3]);
             if mass.abs() > LEAST_PAYLOAD && (moment / mass).length() < LONGEST_ARM {
                 *body = body.with_point_mass(mass, moment / mass);
@@ -66,13 +68,26 @@ pub fn apply(robot: &mut Robot, law: &Law, site: Site, unknowns: &[f64], shape: 
     }
 }
 
+/// Returns true if a law at a site leaves a body a positive mass and inertia, so that a model file may state it.
+pub fn is_physical(robot: &Robot, law: &Law, site: Site, unknowns: &[f64]) -> bool {
+    if law.effect.name != "payload" {
+        return true;
+    }
+    let values = (law.form.values)(unknowns, 0.0);
+    let position = DVec3::new(values[1], values[2], values[3]);
+    robot.tree.bodies[body_of(site)].inertia.with_point_mass(values[0], position).is_physical()
+}
+
 /// Returns the least first unknown of a law at a site of a robot: what its file states may be too much.
 pub fn least(law: &Law, robot: &Robot, site: Site) -> f64 {
+    if law.effect.name == "payload" {
+        return -LARGEST_LOSS * robot.tree.bodies[body_of(site)].inertia.mass;
+    }
     let amount = match site {
-        Site::Joint(joint) => law.effect.amount(&robot.joints[joint]) / robot.scale[joint],
-        Site::Base => 0.0,
+        Site::Joint(joint) if law.effect.is_of_sum() => law.effect.amount(&robot.joints[joint]) / robot.scale[joint],
+        _ => 0.0,
     };
-    if law.is_positive { -amount } else { f64::NEG_INFINITY }
+    if law.form.is_positive { -amount } else { f64::NEG_INFINITY }
 }
 
 /// Returns the index of the body at a site.

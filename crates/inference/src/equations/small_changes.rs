@@ -2,7 +2,7 @@
 
 use glam::{DAffine3, DVec3};
 
-use super::law::Law;
+use super::law::{Law, Presence};
 use super::nuisance;
 use super::robot::Robot;
 use crate::JointLog;
@@ -41,7 +41,7 @@ impl SmallChange {
         }
         match self {
             Self::OfLaw { law, joint, unknown } => {
-                let mut unknowns = vec![0.0; laws[law].units.len()];
+                let mut unknowns = vec![0.0; laws[law].form.units.len()];
                 unknowns[unknown] = value;
                 nuisance::add(robot, &laws[law], joint, &unknowns, laws[law].shapes[0]);
             }
@@ -65,40 +65,24 @@ impl SmallChange {
     /// Returns the least value that is possible on top of what a robot has.
     pub fn least(self, laws: &[Law], robot: &Robot) -> f64 {
         let Self::OfLaw { law, joint, .. } = self else { return f64::NEG_INFINITY };
-        let (joint, scale) = (&robot.joints[joint], robot.scale[joint]);
-        match laws[law].effect.name {
-            "coulomb_friction" => -joint.coulomb_friction / scale,
-            "viscous_friction" => -joint.viscous_friction / scale,
-            "load_friction" => -joint.load_friction,
-            "armature" => -joint.armature / scale,
-            "command_delay" | "torque_delay" | "drive_lag" | "torque_dead_zone" => 0.0,
-            _ => f64::NEG_INFINITY,
+        let law = &laws[law];
+        if !law.form.is_positive {
+            return f64::NEG_INFINITY;
         }
+        let scale = if law.form.is_of_torque { robot.scale[joint] } else { 1.0 };
+        // What a strength adds cannot be taken away.
+        if law.form.is_strength { 0.0 } else { -law.effect.amount(&robot.joints[joint]) / scale }
     }
 }
-
-/// Laws that every joint has a little of, as far as positions show them, with the standard deviations of [`nuisance`].
-const SMALL_LAWS: [&str; 8] = [
-    "command_delay",
-    "pd_gain",
-    "drive_lag",
-    "coulomb_friction",
-    "viscous_friction",
-    "load_friction",
-    "armature",
-    "encoder_offset",
-];
 
 /// Returns the small unknowns of a robot whose positions a log has.
 pub fn small_unknowns(robot: &Robot, laws: &[Law], log: &JointLog) -> Vec<SmallUnknown> {
     let mut small = Vec::new();
     for channels in &log.joints {
-        for name in SMALL_LAWS {
-            let law = laws.iter().enumerate().filter(|(_, law)| law.effect.name == name);
-            let Some((law, found)) = law.max_by_key(|(_, law)| law.units.len()) else { continue };
-            small.extend((0..found.units.len()).map(|unknown| SmallUnknown {
+        for (law, found) in laws.iter().enumerate().filter(|(_, law)| law.form.little == Presence::Everywhere) {
+            small.extend(found.form.small.iter().enumerate().map(|(unknown, std)| SmallUnknown {
                 change: SmallChange::OfLaw { law, joint: channels.joint, unknown },
-                std: nuisance::small_std(name, unknown),
+                std: *std,
             }));
         }
         let joint = channels.joint;

@@ -187,7 +187,7 @@ impl System {
     /// Returns what a law changes at a site: the column of `after` minus `before`.
     pub fn column(&self, law: &Law, site: Site, before: (&Robot, &Predicted), after: &Robot) -> Column {
         let (robot, predicted) = before;
-        match (law.place, site) {
+        match (law.form.place, site) {
             (Place::Drive | Place::Supply, Site::Joint(joint)) => self.drive_column(joint, predicted, after),
             (Place::Supply, Site::Base) => {
                 let columns = (0..robot.joints.len()).map(|joint| self.drive_column(joint, predicted, after));

@@ -14,7 +14,7 @@ use super::problem::Search;
 use super::residuals::Small;
 use super::robot::Robot;
 use super::search::LEAST_GAIN;
-use super::site::{Site, apply};
+use super::site::{Site, apply, body_of, is_physical, least};
 use super::system::System;
 
 const ROWS: usize = 1200;
@@ -101,7 +101,7 @@ fn difference(before: &[Block], after: &[Block], column: &Column) -> [f64; 2] {
 }
 
 fn site_of(law: &Law) -> Site {
-    if matches!(law.place, Place::Body | Place::Gyro | Place::Supply) { Site::Base } else { Site::Joint(4) }
+    if matches!(law.form.place, Place::Body | Place::Gyro | Place::Supply) { Site::Base } else { Site::Joint(4) }
 }
 
 #[test]
@@ -119,7 +119,7 @@ fn joints_of_legs_in_the_air_have_equations_while_the_base_moves_and_those_of_st
 fn gain_below_its_bound_is_not_allowed() {
     let all = laws();
     let both =
-        all.iter().find(|law| law.effect.name == "pd_gain" && law.units.len() == 2).expect("a law of both gains");
+        all.iter().find(|law| law.effect.name == "pd_gain" && law.form.units.len() == 2).expect("a law of both gains");
     assert!(both.allows(&[-0.5, 0.0], 0.0));
     assert!(!both.allows(&[-1.5, 0.0], 0.0));
 }
@@ -135,9 +135,9 @@ fn check_columns(log: &Log) {
     let (system, robot) = system_of(log);
     let (predicted, before) = (system.predicted(&robot), residuals(&system, &robot));
     for law in laws() {
-        for unknown in 0..law.units.len() {
-            let mut unknowns = vec![0.0; law.units.len()];
-            unknowns[unknown] = 0.02 * law.units[unknown];
+        for unknown in 0..law.form.units.len() {
+            let mut unknowns = vec![0.0; law.form.units.len()];
+            unknowns[unknown] = 0.02 * law.form.units[unknown];
             let mut after = robot.clone();
             apply(&mut after, &law, site_of(&law), &unknowns, law.shapes[0]);
             let column = system.column(&law, site_of(&law), (&robot, &predicted), &after);
@@ -165,6 +165,21 @@ fn friction_is_seen_by_a_sensor_at_the_output_and_by_the_balance_if_the_current_
     assert!(seen(TorqueSensor::MotorCurrent).iter().all(|name| !name.starts_with("torque")));
     let at_output = seen(TorqueSensor::JointOutput);
     assert!(!at_output.is_empty() && at_output.iter().all(|name| name.starts_with("torque")), "{at_output:?}");
+}
+
+#[test]
+fn payload_takes_away_no_more_than_a_body_has() {
+    let (_, robot) = system();
+    let all = laws();
+    let law = all.iter().find(|law| law.effect.name == "payload").expect("a law");
+    for site in [Site::Base, Site::Joint(0), Site::Joint(2)] {
+        let mass = robot.tree.bodies[body_of(site)].inertia.mass;
+        let lightest = law.possible(-10.0, least(law, &robot, site));
+        assert!(lightest < 0.0 && mass + lightest > 0.0, "{site:?}: {lightest} of {mass} kg");
+        assert!(is_physical(&robot, law, site, &[0.5, 0.0, 0.0, 0.05]));
+        let far = [0.5 * lightest, 0.0, 0.0, 0.5 * lightest];
+        assert!(!is_physical(&robot, law, site, &far), "half of the mass, taken from 1 m away");
+    }
 }
 
 /// A robot with a hundredth less torque and less of all masses lacks exactly as much.
@@ -238,7 +253,7 @@ fn readings_that_are_missing_leave_all_columns_finite() {
         let predicted = system.predicted(&robot);
         for law in laws() {
             let mut after = robot.clone();
-            apply(&mut after, &law, site_of(&law), &law.units, law.shapes[0]);
+            apply(&mut after, &law, site_of(&law), &law.form.units, law.shapes[0]);
             let column = system.column(&law, site_of(&law), (&robot, &predicted), &after);
             let finite = column.parts.iter().flat_map(|(_, rows)| rows).all(|row| row.is_finite());
             assert!(finite, "{name} missing, {}", law.effect.name);

@@ -1,8 +1,72 @@
-//! Files of a command with several stages: a file exists only when it is complete, also after a power failure.
+//! Commands of several stages that continue after an interruption: a file exists only when it is complete, also after a power failure.
+//!
+//! The results are in a folder beside the config file, with copies of the inputs: other inputs are refused.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-use crate::exit::{CommandResult, Failure};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use twinstep_agent::RunSummary;
+
+use crate::exit::{CommandResult, Failure, Signals, other};
+use crate::run;
+
+/// Returns the folder of the results of a config file: its path without its extension.
+pub fn folder_of(config: &Path) -> Result<PathBuf, Failure> {
+    let out = config.with_extension("");
+    if out == config {
+        let path = out.display();
+        return Err(Failure::Input(miette::miette!("`{path}`: the config file needs an extension, such as .toml")));
+    }
+    Ok(out)
+}
+
+/// Says that the same command continues, if it was interrupted.
+pub fn ended(result: CommandResult) -> CommandResult {
+    if matches!(result, Err(Failure::Interrupted)) {
+        eprintln!("interrupted; the same command continues");
+    }
+    result
+}
+
+/// Records the log of a stage and a summary of it, unless both are there. An incomplete log is never kept.
+pub fn recorded<T: Serialize + DeserializeOwned>(
+    (log, summary): (&Path, &Path),
+    seconds: f64,
+    recording: impl FnOnce(&Path) -> run::Args,
+    signals: &Signals,
+    summarised: impl FnOnce(&RunSummary, &Path) -> Result<T, Failure>,
+) -> Result<T, Failure> {
+    if log.exists() && summary.exists() {
+        return read_json(summary);
+    }
+    let partial = log.with_extension("partial");
+    discard(&partial)?;
+    discard(log)?;
+    let recorded = run::record(&recording(&partial), signals)?.summary;
+    // SIGTERM ends a run as its duration does.
+    if signals.check()? || recorded.seconds < seconds - 1e-6 {
+        return Err(Failure::Interrupted);
+    }
+    let found = summarised(&recorded, &partial)?;
+    write_json(summary, &found)?;
+    complete(&partial, log)?;
+    Ok(found)
+}
+
+/// Reads a result of an earlier run of the command.
+pub fn read_json<T: DeserializeOwned>(path: &Path) -> Result<T, Failure> {
+    let wrong = |cause: String| {
+        Failure::Input(miette::miette!("cannot read {}: {cause}\n  remove it to repeat its stage", path.display()))
+    };
+    let text = std::fs::read_to_string(path).map_err(|error| wrong(error.to_string()))?;
+    serde_json::from_str(&text).map_err(|error| wrong(error.to_string()))
+}
+
+/// Writes a result as JSON.
+pub fn write_json(path: &Path, result: &impl Serialize) -> CommandResult {
+    write(path, serde_json::to_string_pretty(result).map_err(other)?.as_bytes())
+}
 
 /// Writes a file as a whole.
 pub fn write(path: &Path, content: &[u8]) -> CommandResult {
