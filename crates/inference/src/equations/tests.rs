@@ -253,7 +253,7 @@ fn readings_that_are_missing_leave_all_columns_finite() {
         let predicted = system.predicted(&robot);
         for law in laws() {
             let mut after = robot.clone();
-            apply(&mut after, &law, site_of(&law), &law.form.units, law.shapes[0]);
+            apply(&mut after, &law, site_of(&law), law.form.units, law.shapes[0]);
             let column = system.column(&law, site_of(&law), (&robot, &predicted), &after);
             let finite = column.parts.iter().flat_map(|(_, rows)| rows).all(|row| row.is_finite());
             assert!(finite, "{name} missing, {}", law.effect.name);
