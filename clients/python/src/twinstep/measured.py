@@ -203,26 +203,28 @@ def diagnose(logs: File | Sequence[File], *, out: File | None = None, model: Fil
 def _run(arguments: list[str]) -> str:
     """Run the program, with its progress on stderr, and return its stdout."""
     command = [find_program(), *arguments]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    assert process.stderr is not None
     said: list[str] = []
-    try:
-        # Its results on stdout are short, so that it never waits for a reader.
-        for line in process.stderr:
-            said.append(line)
-            print(line, end="", file=sys.stderr)
-        printed = process.stdout.read()
-        code = process.wait()
-    except BaseException:
-        process.terminate()
+    # A file, because a full pipe would stop the program.
+    with tempfile.TemporaryFile("w+") as printed:
+        process = subprocess.Popen(command, stdout=printed, stderr=subprocess.PIPE, text=True)
+        assert process.stderr is not None
         try:
-            process.wait(_SHUTDOWN_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-        raise
-    if code == 0:
-        return printed
+            for line in process.stderr:
+                said.append(line)
+                print(line, end="", file=sys.stderr)
+            code = process.wait()
+        except BaseException:
+            process.terminate()
+            try:
+                process.wait(_SHUTDOWN_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+            raise
+        finally:
+            process.stderr.close()
+        if code == 0:
+            printed.seek(0)
+            return printed.read()
     message = "".join(said[-20:]).strip().rpartition("error: ")[2]
     raise (InvalidOptionError if code == _BAD_INPUT else CommandError)(message)
 

@@ -97,14 +97,14 @@ impl<R: Residuals> Search<'_, R> {
             let cause = others.remove(place);
             let name = self.name(&cause);
             let without = self.fit(others, &best.small, self.system.trial_steps(), Some(&best));
+            let candidates = self.screen_at(&without, Some(&cause.scope.sites));
             let mut fits: Vec<Fitted<R>> = Vec::new();
-            for rival in self.rivals_of(&cause, &without) {
+            for (_, rival) in candidates.into_iter().filter(|(_, one)| one.law != cause.law).take(RIVALS) {
                 if !go_on(&format!("{}, trying {} in place of {name}", self.progress(&best), self.name(&rival))) {
                     return None;
                 }
                 let causes = [without.causes.as_slice(), &[rival]].concat();
-                // From where the cause was: the fit without it has what joints have a little of in its place.
-                let fit = self.fit(causes, &best.small, self.system.fit_steps(), Some(&best));
+                let fit = self.fit(causes, &without.small, self.system.fit_steps(), Some(&without));
                 let line = format!(
                     "  {} in place of {name}: {:.1} nat",
                     self.name(&fit.causes[fit.causes.len() - 1]),
@@ -125,24 +125,17 @@ impl<R: Residuals> Search<'_, R> {
                 best = self.fit(better.causes.clone(), &better.small, self.system.trial_steps(), Some(&better));
             }
             let rival = |fit: &Fitted<R>| (fit.causes[fit.causes.len() - 1].clone(), fit.evidence - best.evidence);
-            let others = fits.iter().map(rival).collect();
+            let mut others: Vec<(Cause, f64)> = fits.iter().map(rival).collect();
+            // Those of when it was added are other ones.
+            let known = |rivals: &&Rivals| rivals.law == replaced.law && rivals.scope == replaced.scope.label();
+            let earlier = self.rivals.iter().rfind(known).map_or(Vec::new(), |rivals| rivals.others.clone());
+            let is_new =
+                |one: &Cause| !others.iter().any(|(other, _)| one.law == other.law && one.scope == other.scope);
+            let added: Vec<(Cause, f64)> = earlier.into_iter().filter(|(one, _)| is_new(one)).collect();
+            others.extend(added);
+            others.sort_by(|one, other| other.1.total_cmp(&one.1));
             self.rivals.push(Rivals { law: replaced.law, scope: replaced.scope.label(), others });
         }
         Some(best)
-    }
-
-    /// Returns what may stand in the place of a cause: the best candidates beside the others, and those that were close when it was added.
-    fn rivals_of(&self, cause: &Cause, without: &Fitted<R>) -> Vec<Cause> {
-        let screened = self.screen_at(without, Some(&cause.scope.sites)).into_iter().map(|(_, rival)| rival);
-        let mut rivals: Vec<Cause> = screened.filter(|rival| rival.law != cause.law).take(RIVALS).collect();
-        let known = |rivals: &&Rivals| rivals.law == cause.law && rivals.scope == cause.scope.label();
-        let earlier = self.rivals.iter().rfind(known).map_or(Vec::new(), |rivals| rivals.others.clone());
-        let close = earlier.into_iter().filter(|(rival, behind)| *behind > -LEAST_BETTER && rival.law != cause.law);
-        for (rival, _) in close {
-            if !rivals.iter().any(|other| rival.law == other.law && rival.scope == other.scope) {
-                rivals.push(rival);
-            }
-        }
-        rivals
     }
 }
