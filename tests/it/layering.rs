@@ -240,7 +240,7 @@ const LINES_OF_EFFECTS: [(&str, usize); 6] = [
     ("crates/envs", 7),
     ("crates/diagnose", 3),
     ("crates/robot", 2),
-    ("crates/inference", 17),
+    ("crates/inference", 16),
     ("crates/hunt", 3),
 ];
 /// Crates in which the names are attributes of robot files, or the catalogue itself.

@@ -66,7 +66,12 @@ impl TreeSimulation {
                 let allowed = "`batch` for a robot whose free joint has armature, damping or friction";
                 return Err(refused("engine", "rapier", allowed).into());
             }
-            Engine::Batch => tree_batches(precision, robot, &config, 1.0 / actuator_hz, num_robots, initial_state),
+            Engine::Batch => {
+                // A base that is held has no equations, which a base without mass, as in many URDF files, does not solve.
+                let mut robot = robot.clone();
+                robot.tree.base = Some(config.base);
+                tree_batches(precision, &robot, &config, 1.0 / actuator_hz, num_robots, initial_state)
+            }
             Engine::Rapier => Box::new(RapierTrees::new(robot, &config, 1.0 / actuator_hz, num_robots, initial_state)),
             Engine::Mujoco => Box::new(MujocoTrees::new(robot, &config, actuator_hz, num_robots, initial_state)?),
         };
@@ -183,6 +188,28 @@ mod tests {
         let error = robots.reset(2, &robot(), &start()).expect_err("two robots");
         assert_eq!(error.to_string(), "robot 2 does not exist; the number of robots is 2");
         assert_eq!(robots.states(), before);
+    }
+
+    /// URDF files often begin with a link without mass, and state neither damping nor rotor inertia.
+    #[test]
+    fn held_base_moves_the_robot_alike_with_any_mass() {
+        let positions = |mass: f64| {
+            let mut pendulum = robot();
+            pendulum.tree.base = None;
+            pendulum.tree.bodies[0].inertia = pendulum.tree.bodies[0].inertia.scaled(mass);
+            pendulum.points.clear();
+            for joint in &mut pendulum.joints {
+                (joint.armature, joint.viscous_friction, joint.coulomb_friction) = (0.0, 0.0, 0.0);
+            }
+            let config = SimConfig { base: twinstep_model::BaseMount::Fixed, threads: 1, ..SimConfig::default() };
+            let mut robots = TreeSimulation::new(&pendulum, &config, 200.0, 1, &start()).expect("a robot");
+            let command = TreeCommand::hold(vec![0.1; 12], 5.0, 0.2);
+            robots.step(&[command], 40).expect("one command");
+            robots.states()[0].state.q.clone()
+        };
+        let [without, with] = [0.0, 1.0].map(positions);
+        assert!(without.iter().all(|q| q.is_finite()), "{without:?}");
+        assert_eq!(without, with);
     }
 
     #[test]

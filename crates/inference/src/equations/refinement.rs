@@ -92,6 +92,7 @@ impl<R: Residuals> Search<'_, R> {
 
     /// Compares each cause with others on its sites, and replaces it by one that is better.
     pub fn with_rivals(&mut self, mut best: Fitted<R>, go_on: &mut dyn FnMut(&str) -> bool) -> Option<Fitted<R>> {
+        let mut is_replaced = false;
         for place in 0..best.causes.len() {
             let mut others = best.causes.clone();
             let cause = others.remove(place);
@@ -122,6 +123,7 @@ impl<R: Residuals> Search<'_, R> {
                 let added = better.causes.len() - 1;
                 better.causes.swap(place, added);
                 replaced = better.causes[place].clone();
+                is_replaced = true;
                 best = self.fit(better.causes.clone(), &better.small, self.system.trial_steps(), Some(&better));
             }
             let rival = |fit: &Fitted<R>| (fit.causes[fit.causes.len() - 1].clone(), fit.evidence - best.evidence);
@@ -136,6 +138,7 @@ impl<R: Residuals> Search<'_, R> {
             others.sort_by(|one, other| other.1.total_cmp(&one.1));
             self.rivals.push(Rivals { law: replaced.law, scope: replaced.scope.label(), others });
         }
-        Some(best)
+        // What took the place of a cause may explain another one, too.
+        Some(if is_replaced { self.without_surplus(best) } else { best })
     }
 }

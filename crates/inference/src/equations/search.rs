@@ -194,7 +194,7 @@ impl<R: Residuals> Search<'_, R> {
     }
 
     /// Removes causes that no longer have evidence beside the others.
-    fn without_surplus(&mut self, mut best: Fitted<R>) -> Fitted<R> {
+    pub fn without_surplus(&mut self, mut best: Fitted<R>) -> Fitted<R> {
         while !best.causes.is_empty() {
             let fits = (0..best.causes.len()).map(|removed| {
                 let mut causes = best.causes.clone();

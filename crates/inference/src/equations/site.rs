@@ -9,8 +9,8 @@ use super::robot::Robot;
 /// Mass above which a payload changes the inertia of a body, too [kg], if it is no farther from the body's origin than this [m].
 const LEAST_PAYLOAD: f64 = 0.05;
 const LONGEST_ARM: f64 = 0.5;
-/// Largest part of a body's mass that a payload may take away.
-const LARGEST_LOSS: f64 = 0.9;
+/// Mass that columns are computed with at least, relative to a body's own: less is no body, and [`is_physical`] refuses it.
+const LEAST_MASS: f64 = 0.1;
 /// Least factor on the second moment of a body along an axis.
 const LEAST_MOMENT: f64 = 0.1;
 
@@ -37,7 +37,7 @@ pub fn apply(robot: &mut Robot, law: &Law, site: Site, unknowns: &[f64], shape: 
         ("payload", site) => {
             // The unknowns are mass and first moment, in which forces are nearly linear.
             let body = &mut robot.tree.bodies[body_of(site)].inertia;
-            let mass = unknowns[0].max(-LARGEST_LOSS * body.mass);
+            let mass = unknowns[0].max((LEAST_MASS - 1.0) * body.mass);
             let moment = DVec3::new(unknowns[1], unknowns[2], unknowns[3]);
             if mass.abs() > LEAST_PAYLOAD && (moment / mass).length() < LONGEST_ARM {
                 *body = body.with_point_mass(mass, moment / mass);
@@ -80,9 +80,6 @@ pub fn is_physical(robot: &Robot, law: &Law, site: Site, unknowns: &[f64]) -> bo
 
 /// Returns the least first unknown of a law at a site of a robot: what its file states may be too much.
 pub fn least(law: &Law, robot: &Robot, site: Site) -> f64 {
-    if law.effect.name == "payload" {
-        return -LARGEST_LOSS * robot.tree.bodies[body_of(site)].inertia.mass;
-    }
     let amount = match site {
         Site::Joint(joint) if law.effect.is_of_sum() => law.effect.amount(&robot.joints[joint]) / robot.scale[joint],
         _ => 0.0,
