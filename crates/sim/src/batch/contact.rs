@@ -8,7 +8,7 @@
 use twinstep_dynamics::{JointValues, State, StepEquations, Vec3};
 use twinstep_simd::SimdFloat;
 
-use super::ground::{LocalTerrain, TangentPlane};
+use super::ground::TangentPlane;
 use super::rows::{ConstraintRow, PointRow, SoftConstraint, complete_friction, write_base_row, write_joint_row};
 use super::surface::{ContactParams, PointsOfBody, SimdPoint};
 
@@ -18,7 +18,7 @@ const MANY_POINTS: usize = 5;
 /// Impulses of the last step, the initial guess of the next one.
 #[derive(Clone, Debug)]
 pub struct Impulses<T> {
-    /// Impulse along the normal and the two tangents of each contact point [N·s].
+    /// Impulse along the normal and the two tangents of each contact, `contacts_of_point` for a point [N·s].
     pub points: Vec<[T; 3]>,
     /// Impulse of the lower and upper limit of each joint [N·m·s or N·s].
     pub limits: Vec<[T; 2]>,
@@ -30,10 +30,10 @@ pub struct Impulses<T> {
 
 impl<T: SimdFloat> Impulses<T> {
     /// Creates impulses of zero.
-    pub fn zero(points: usize, joints: usize) -> Self {
+    pub fn zero(contacts: usize, joints: usize) -> Self {
         let zero = T::splat(0.0);
         Self {
-            points: vec![[zero; 3]; points],
+            points: vec![[zero; 3]; contacts],
             limits: vec![[zero; 2]; joints],
             frictions: vec![zero; joints],
             base_frictions: [zero; 6],
@@ -59,12 +59,22 @@ pub struct Step<'a, T: SimdFloat, E: StepEquations<T>> {
     pub dt: T,
 }
 
-/// Constraint rows of a contact point: normal and two tangents.
+/// Constraint rows of a contact: normal and two tangents.
 struct PointBlock<T, B> {
     rows: [ConstraintRow<T, B>; 3],
     /// Velocity change along each tangent per unit of normal impulse.
     couplings: [T; 2],
     body: usize,
+}
+
+/// Sphere of a body near the ground.
+struct TouchingSphere<T> {
+    /// Centre in the base frame [m].
+    centre: Vec3<T>,
+    /// Radius [m].
+    radius: T,
+    /// Velocity of the base origin in the base frame [m/s].
+    velocity: Vec3<T>,
 }
 
 /// Constraint row of a joint, and the body on which it acts.
@@ -88,7 +98,7 @@ pub struct Constraints<T, B> {
 }
 
 impl<T: SimdFloat, B: JointValues<T>> Constraints<T, B> {
-    /// Creates constraints of which none is active, for points of `bodies`. They are large, so the steps share them.
+    /// Creates constraints of which none is active, for contacts of `bodies`. They are large, so the steps share them.
     pub fn empty<E: StepEquations<T, Branch = B>>(equations: &E, bodies: &[usize], num_joints: usize) -> Self {
         let row = |body: usize| ConstraintRow::without_effect(equations.zero_branch(body));
         let point = |body: &usize| PointBlock {
@@ -163,17 +173,23 @@ impl<T: SimdFloat, B: JointValues<T>> Constraints<T, B> {
     #[inline(always)]
     fn detect_contacts<E: StepEquations<T, Branch = B>>(&mut self, step: &Step<'_, T, E>, impulses: &mut Impulses<T>) {
         let zero = T::splat(0.0);
-        let ground = step.surface.ground.local_ground(step.state);
+        let (ground, each) = (step.surface.ground.local_ground(step.state), step.surface.ground.contacts_of_point());
         for PointsOfBody { body, points, centre, radius } in &step.surface.bodies {
             if points.len() >= MANY_POINTS {
                 let lowest = ground.lowest_within(step.equations.point(*body, *centre), *radius);
                 if !lowest.any_lt(zero) {
-                    impulses.points[points.clone()].fill([zero; 3]);
+                    impulses.points[each * points.start..each * points.end].fill([zero; 3]);
                     continue;
                 }
             }
             for point in points.clone() {
-                self.detect_contact(step, &ground, &mut impulses.points[point], point);
+                let SimdPoint { centre, radius } = step.surface.points[point];
+                let centre = step.equations.point(*body, centre);
+                let sphere = TouchingSphere { centre, radius, velocity: ground.velocity };
+                for (index, plane) in ground.contacts(centre, radius).into_iter().take(each).enumerate() {
+                    let contact = each * point + index;
+                    self.detect_contact(step, &sphere, plane, &mut impulses.points[contact], contact);
+                }
             }
         }
     }
@@ -182,27 +198,26 @@ impl<T: SimdFloat, B: JointValues<T>> Constraints<T, B> {
     fn detect_contact<E: StepEquations<T, Branch = B>>(
         &mut self,
         step: &Step<'_, T, E>,
-        ground: &LocalTerrain<'_, T>,
+        sphere: &TouchingSphere<T>,
+        plane: TangentPlane<T>,
         impulses: &mut [T; 3],
-        point: usize,
+        contact: usize,
     ) {
-        let Step { equations, state, surface, dt } = *step;
-        let (zero, SimdPoint { centre, radius }) = (T::splat(0.0), surface.points[point]);
-        let PointBlock { rows: [normal, tangents @ ..], couplings, body } = &mut self.points[point];
-        let centre = equations.point(*body, centre);
-        let TangentPlane { height, directions } = ground.plane_below(centre);
-        let distance = height - radius;
+        let (zero, TangentPlane { height, directions }) = (T::splat(0.0), plane);
+        let distance = height - sphere.radius;
         if !distance.any_lt(zero) {
             *impulses = [zero; 3];
             return;
         }
+        let Step { equations, state, surface, dt } = *step;
+        let PointBlock { rows: [normal, tangents @ ..], couplings, body } = &mut self.points[contact];
         for impulse in impulses {
             *impulse = distance.select_lt(zero, *impulse, zero);
         }
         let softness = SoftConstraint { time_constant: surface.time_constant, distance, dt };
-        let place = centre - directions[0].scaled(radius);
+        let place = sphere.centre - directions[0].scaled(sphere.radius);
         let row =
-            PointRow { equations, state, velocity: ground.velocity, body: *body, place, moving: surface.is_floating };
+            PointRow { equations, state, velocity: sphere.velocity, body: *body, place, moving: surface.is_floating };
         let velocity = row.write(normal, directions[0]);
         softness.complete_unilateral(normal, velocity);
         for (along, tangent) in tangents.iter_mut().enumerate() {
@@ -210,7 +225,7 @@ impl<T: SimdFloat, B: JointValues<T>> Constraints<T, B> {
             softness.complete_tangent(tangent, velocity, normal);
             couplings[along] = tangent.response(normal);
         }
-        self.active_points.push(point);
+        self.active_points.push(contact);
     }
 
     #[inline(always)]

@@ -1,66 +1,84 @@
-//! The ground of the batch engine: a plane, or a height field with one tangent plane per contact point.
-
-use std::sync::Arc;
+//! The ground of the batch engine: a plane, or a height field.
 
 use glam::DVec3;
 use twinstep_dynamics::{State, Vec3};
-use twinstep_model::{Ground, HeightField};
+use twinstep_model::Ground;
 use twinstep_simd::SimdFloat;
+
+use super::field::ContactField;
 
 /// Ground under robots in SIMD lanes.
 #[derive(Clone, Debug)]
 pub enum SimdTerrain<T> {
     /// A plane through the origin: its normal and two tangents, in the world frame.
     Plane([Vec3<T>; 3]),
-    /// A height field, and its maximum height [m].
-    Field(Arc<HeightField>, T),
+    /// A height field.
+    Field(ContactField),
 }
 
 impl<T: SimdFloat> SimdTerrain<T> {
     /// Converts the ground of a backend.
     pub fn new(ground: &Ground) -> Self {
         if let Some(field) = &ground.height_field {
-            let highest = field.heights().iter().copied().fold(f32::NEG_INFINITY, f32::max);
-            return Self::Field(field.clone(), T::splat(f64::from(highest)));
+            return Self::Field(ContactField::new(field.clone()));
         }
         let normal = DVec3::from(ground.normal.map(f64::from));
         let across = normal.cross(DVec3::X).normalize();
         Self::Plane([normal, across.cross(normal), across].map(Vec3::splat))
     }
 
+    /// Returns how many contacts a point has at most: on a height field it may touch two faces.
+    pub fn contacts_of_point(&self) -> usize {
+        match self {
+            Self::Plane(_) => 1,
+            Self::Field(_) => MOST_CONTACTS,
+        }
+    }
+
     /// Returns the ground relative to the bases in this state.
     #[inline(always)]
     pub fn local_ground<J>(&self, state: &State<T, J>) -> LocalTerrain<'_, T> {
         let axes = state.world_axes();
-        let (plane, height) = match self {
-            Self::Plane(plane) => (*plane, plane[0].dot(state.position)),
-            Self::Field(_, highest) => {
-                let (zero, one) = (T::splat(0.0), T::splat(1.0));
-                let level = [Vec3([zero, zero, one]), Vec3([one, zero, zero]), Vec3([zero, one, zero])];
-                (level, state.position.0[2] - *highest)
-            }
-        };
-        let directions = [to_base(plane[0], &axes), to_base(plane[1], &axes), to_base(plane[2], &axes)];
         let velocity = to_base(state.linear_velocity, &axes);
-        LocalTerrain { terrain: self, position: state.position, axes, velocity, directions, height }
+        let shape = match self {
+            Self::Plane(plane) => LocalShape::Plane {
+                directions: [to_base(plane[0], &axes), to_base(plane[1], &axes), to_base(plane[2], &axes)],
+                height: plane[0].dot(state.position),
+            },
+            Self::Field(field) => LocalShape::Field { field, position: state.position, axes },
+        };
+        LocalTerrain { shape, velocity }
     }
 }
 
+/// Largest number of contacts of a point.
+const MOST_CONTACTS: usize = 2;
+
 /// Ground relative to the base.
 pub struct LocalTerrain<'a, T> {
-    terrain: &'a SimdTerrain<T>,
-    position: Vec3<T>,
-    /// Axes of the world in the base frame.
-    axes: [Vec3<T>; 3],
+    shape: LocalShape<'a, T>,
     /// Velocity of the base origin in the base frame [m/s].
     pub velocity: Vec3<T>,
-    /// Normal and tangents of the plane, or of the horizontal plane at the maximum height, in the base frame.
-    directions: [Vec3<T>; 3],
-    /// Height of the base origin above that plane [m].
-    height: T,
 }
 
-/// Tangent plane of the ground below a point.
+enum LocalShape<'a, T> {
+    Plane {
+        /// Normal and two tangents, in the base frame.
+        directions: [Vec3<T>; 3],
+        /// Height of the base origin above the plane [m].
+        height: T,
+    },
+    Field {
+        field: &'a ContactField,
+        /// Position of the base [m].
+        position: Vec3<T>,
+        /// Axes of the world in the base frame.
+        axes: [Vec3<T>; 3],
+    },
+}
+
+/// Tangent plane of the ground where a point is nearest to it.
+#[derive(Clone, Copy)]
 pub struct TangentPlane<T> {
     /// Height of the point above the plane, along the normal [m].
     pub height: T,
@@ -72,38 +90,67 @@ impl<T: SimdFloat> LocalTerrain<'_, T> {
     /// Returns a lower bound on the height of every point within `radius` [m] of `centre`, a point of the base frame [m].
     #[inline(always)]
     pub fn lowest_within(&self, centre: Vec3<T>, radius: T) -> T {
-        self.height + self.directions[0].dot(centre) - radius
-    }
-
-    /// Returns the tangent plane below a point of the base frame.
-    #[inline(always)]
-    pub fn plane_below(&self, point: Vec3<T>) -> TangentPlane<T> {
-        match self.terrain {
-            SimdTerrain::Plane(_) => {
-                TangentPlane { height: self.height + self.directions[0].dot(point), directions: self.directions }
+        match &self.shape {
+            LocalShape::Plane { directions, height } => *height + directions[0].dot(centre) - radius,
+            LocalShape::Field { field, position, axes } => {
+                let [x, y, z] = (*position + in_world(centre, axes)).0;
+                let mut highest = z;
+                for lane in 0..T::LANES {
+                    let bound = field.highest(x.get(lane) as f32, y.get(lane) as f32, radius.get(lane) as f32);
+                    highest.set(lane, f64::from(bound));
+                }
+                z - highest - radius
             }
-            SimdTerrain::Field(field, _) => self.below_on_field(field, point),
         }
     }
 
+    /// Returns the tangent plane of each contact that a sphere about a point of the base frame may have. On a plane only the
+    /// first one counts: see [`SimdTerrain::contacts_of_point`].
     #[inline(always)]
-    fn below_on_field(&self, field: &HeightField, point: Vec3<T>) -> TangentPlane<T> {
-        let zero = T::splat(0.0);
-        let [x, y, z] = (self.position + in_world(point, &self.axes)).0;
-        let (mut ground, mut normal): (T, Vec3<T>) = (zero, Vec3::zero());
-        for lane in 0..T::LANES {
-            let (height, upward) = field.sample(x.get(lane) as f32, y.get(lane) as f32);
-            ground.set(lane, f64::from(height));
-            normal.set(lane, DVec3::from(upward.map(f64::from)));
+    pub fn contacts(&self, centre: Vec3<T>, radius: T) -> [TangentPlane<T>; MOST_CONTACTS] {
+        match &self.shape {
+            LocalShape::Plane { directions, height } => {
+                [TangentPlane { height: *height + directions[0].dot(centre), directions: *directions }; MOST_CONTACTS]
+            }
+            LocalShape::Field { field, position, axes } => {
+                contacts_with_field(field, *position + in_world(centre, axes), radius, axes)
+            }
         }
-        // The second tangent is normal × x, normalised; its x component is zero.
-        let [_, ny, nz] = normal.0;
-        let size = (ny * ny + nz * nz).sqrt();
-        let across = Vec3([zero, nz / size, -(ny / size)]);
-        let directions =
-            [to_base(normal, &self.axes), to_base(across.cross(normal), &self.axes), to_base(across, &self.axes)];
-        TangentPlane { height: (z - ground) * nz, directions }
     }
+}
+
+#[inline(always)]
+fn contacts_with_field<T: SimdFloat>(
+    field: &ContactField,
+    centre: Vec3<T>,
+    radius: T,
+    axes: &[Vec3<T>; 3],
+) -> [TangentPlane<T>; MOST_CONTACTS] {
+    let ([x, y, z], up) = (centre.0, Vec3::splat(DVec3::Z));
+    let (mut heights, mut normals) = ([z; MOST_CONTACTS], [up; MOST_CONTACTS]);
+    for lane in 0..T::LANES {
+        let centre = glam::DVec3::new(x.get(lane), y.get(lane), z.get(lane)).as_vec3();
+        for (contact, touch) in field.touches(centre, radius.get(lane) as f32).into_iter().enumerate() {
+            heights[contact].set(lane, f64::from(touch.distance));
+            normals[contact].set(lane, touch.normal.as_dvec3());
+        }
+    }
+    std::array::from_fn(|contact| {
+        let [normal, along, across] = with_tangents(normals[contact]);
+        TangentPlane {
+            height: heights[contact],
+            directions: [to_base(normal, axes), to_base(along, axes), to_base(across, axes)],
+        }
+    })
+}
+
+/// Returns an upward normal and two tangents; x and y on level ground (Duff et al. 2017, equation 3).
+#[inline(always)]
+fn with_tangents<T: SimdFloat>(normal: Vec3<T>) -> [Vec3<T>; 3] {
+    let ([x, y, z], one) = (normal.0, T::splat(1.0));
+    let scale = one / (one + z);
+    let mixed = -(x * y * scale);
+    [normal, Vec3([one - x * x * scale, mixed, -x]), Vec3([mixed, one - y * y * scale, -y])]
 }
 
 /// Transforms a vector from the world frame to the base frame.

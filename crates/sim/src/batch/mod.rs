@@ -5,7 +5,7 @@
 //! quadruped, which are faster.
 //!
 //! - [`batch_robot`]: what the engine needs of a robot.
-//! - [`surface`]: what of a robot touches the ground. [`contact`], [`rows`] and [`ground`]: contacts, joint limits and joint friction as MuJoCo's soft constraints.
+//! - [`surface`]: what of a robot touches the ground. [`contact`], [`rows`], [`ground`] and [`field`]: contacts, joint limits and joint friction as MuJoCo's soft constraints.
 //! - [`group`]: a [`robot_batch::RobotBatch`] is the state of the robots in one register.
 //! - [`simulator`]: steps batches on all cores, in the widest registers of the processor.
 //! - [`BatchBackend`]: the engine for quadrupeds. [`trees`]: robots of any tree.
@@ -18,6 +18,7 @@
 
 mod batch_robot;
 mod contact;
+mod field;
 mod ground;
 mod robot_batch;
 mod rows;

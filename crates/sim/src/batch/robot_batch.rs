@@ -96,7 +96,7 @@ impl<T: SimdFloat, E: StepEquations<T, Robot: BatchRobot>> RobotBatch<T, E> {
             changes: zero.clone(),
             tau: zero,
             gyro_bias: Vec3::splat(robot.gyro_bias()),
-            impulses: Impulses::zero(surface.points.len(), num_joints),
+            impulses: Impulses::zero(surface.num_contacts(), num_joints),
             surface,
             dt: T::splat(dt),
             iterations: config.solver_iterations() as usize,
@@ -109,7 +109,9 @@ impl<T: SimdFloat, E: StepEquations<T, Robot: BatchRobot>> RobotBatch<T, E> {
 
     /// Returns what the workspaces of batches like this one have in common.
     pub fn workspace_shape(&self) -> WorkspaceShape<T, E> {
-        let bodies = self.surface.bodies.iter().flat_map(|of_body| of_body.points.clone().map(|_| of_body.body));
+        let each = self.surface.ground.contacts_of_point();
+        let bodies = self.surface.bodies.iter();
+        let bodies = bodies.flat_map(|of_body| std::iter::repeat_n(of_body.body, each * of_body.points.len()));
         WorkspaceShape {
             parameters: self.parameters.clone(),
             bodies: bodies.collect(),
@@ -311,9 +313,11 @@ impl<T: SimdFloat, E: StepEquations<T, Robot: BatchRobot>> RobotBatch<T, E> {
         &self.tau
     }
 
-    /// Returns the normal force on a contact point in the last step [N].
+    /// Returns the normal force on a contact point in the last step, summed over the faces that it touches [N].
     pub fn point_force(&self, lane: usize, point: usize) -> f64 {
-        self.impulses.points[point][0].get(lane) / self.dt.get(lane)
+        let each = self.surface.ground.contacts_of_point();
+        let contacts = &self.impulses.points[each * point..each * (point + 1)];
+        contacts.iter().map(|impulse| impulse[0].get(lane)).sum::<f64>() / self.dt.get(lane)
     }
 
     /// Returns the number of contact points.

@@ -55,6 +55,11 @@ pub struct PointsOfBody<T> {
 }
 
 impl<T: SimdFloat> ContactParams<T> {
+    /// Returns how many contacts there are at most.
+    pub fn num_contacts(&self) -> usize {
+        self.points.len() * self.ground.contacts_of_point()
+    }
+
     /// Returns the contact points and limits of `robot` in every lane, on `ground`. Friction and time constant of the ground are still
     /// zero: they differ by robot.
     pub fn new<E: StepEquations<T, Robot: BatchRobot>>(

@@ -17,7 +17,7 @@ pub struct Workspace<T: SimdFloat, E: StepEquations<T>> {
 pub struct WorkspaceShape<T: SimdFloat, E: StepEquations<T>> {
     /// Parameters of a batch, for their sizes.
     pub parameters: E::Parameters,
-    /// Body of each contact point.
+    /// Body of each contact.
     pub bodies: Vec<usize>,
     /// Number of joints.
     pub num_joints: usize,
