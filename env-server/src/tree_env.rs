@@ -2,7 +2,9 @@
 
 use glam::{DAffine3, DQuat, Vec3};
 use twinstep_effects::{RobotSampler, TreeModelFile};
-use twinstep_envs::{ControlledRobot, Episode, NoisyEntry, Randomisation, StepOutcome, Task, add_noise};
+use twinstep_envs::{
+    ControlledRobot, Episode, NoisyEntry, Randomisation, StepOutcome, Task, add_noise, observe_next, repeat_first_frame,
+};
 use twinstep_model::{
     AgentCommands, AutoresetMode, BackendError, BaseMount, EndedEpisode, EnvError, EnvSpec, GaitCommand, Ground,
     ResetRequest, Scene, StepBatch, TreeModel, VecEnv, VelocityCommand, frames,
@@ -108,6 +110,7 @@ impl<T: Task> TreeEnv<T> {
         simulation.reset(env, model, &placement).map_err(failed)?;
         episodes[env].set_commands(task, &self.agent_commands, env);
         self.observe(env);
+        repeat_first_frame(&self.task, row(&mut self.batch.obs, env, self.spec.obs_len()));
         Ok(())
     }
 
@@ -117,7 +120,7 @@ impl<T: Task> TreeEnv<T> {
         rows[env].read(&simulation.states()[env]);
         let (episode, robot) = (&mut episodes[env], rows[env].view(ground));
         let obs = row(&mut batch.obs, env, spec.obs_len());
-        task.observe(&episode.state, &robot, &episode.action, obs);
+        observe_next(task, &episode.state, &robot, &episode.action, obs);
         add_noise(noise, obs, &mut episode.noise);
         if !spec.critic_observation.is_empty() {
             task.observe_critic(&episode.state, &robot, row(&mut batch.critic_obs, env, spec.critic_obs_len()));

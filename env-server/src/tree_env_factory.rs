@@ -6,7 +6,7 @@ use twinstep_effects::{NominalGain, RobotSampler, TreeModelFile};
 use twinstep_envs::{ControlledRobot, PoseTask, Randomisation, Task, TaskConfig, Walk};
 use twinstep_model::{AutoresetMode, BaseMount, Feet, JOINT_NAMES, RobotTree, TreeModel, VecEnv, go2};
 use twinstep_protocol::random_u64;
-use twinstep_sim::{BackendBuildError, Engine, Placement, SimConfig, TreeSimulation};
+use twinstep_sim::{BackendBuildError, Engine, Placement, SimConfig, Terrain, TreeSimulation};
 
 use crate::tree_env::{TreeEnv, TreeEnvConfig};
 use crate::{Config, EnvFactory, EnvFactoryError};
@@ -46,6 +46,12 @@ impl TreeEnvFactory {
             return Err(refused(
                 "task.reward.epistemic_uncertainty",
                 "a robot of any tree has no actuator networks; use 0",
+            ));
+        }
+        if matches!(config.sim.terrain, Terrain::Course(_)) {
+            return Err(refused(
+                "sim.terrain",
+                "a course is for quadrupeds like the Go2; use flat ground, a slope, `rough` or `steps`",
             ));
         }
         let file = match &config.server.model {

@@ -451,7 +451,7 @@ pub fn decode_scene(reply: message::RenderReply<'_>) -> Result<Scene, ErrorReply
 fn decode_ground(ground: message::Ground<'_>) -> Result<Ground, ErrorReply> {
     let message::Ground { point, normal, height_field } = ground;
     let height_field = height_field.map(read_height_field).transpose()?.map(Arc::new);
-    Ok(Ground { point, normal, height_field })
+    Ok(Ground { point, normal, height_field, patches: None })
 }
 
 fn read_height_field(field: message::HeightField<'_>) -> Result<HeightField, ErrorReply> {

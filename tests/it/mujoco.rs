@@ -14,8 +14,9 @@ use twinstep_model::{
     AutoresetMode, Backend, BackendError, BaseMount, Command, EnvError, InitialState, NUM_JOINTS, PerJoint,
     ResetRequest, RobotModel, Simulator, VecEnv, go2,
 };
+use twinstep_policy::{Policy, PolicyRunner};
 use twinstep_sim::{
-    BackendBuildError, BatchBackend, Engine, MujocoBackend, MujocoPlant, RoughTerrain, SimConfig, Terrain,
+    BackendBuildError, BatchBackend, Engine, MujocoBackend, MujocoPlant, RoughTerrain, SimConfig, StepTerrain, Terrain,
 };
 use twinstep_tests::process::Process;
 use twinstep_tests::python::{Programs, python, root, run};
@@ -96,6 +97,54 @@ fn robot_stands_for_5_s_of_zero_actions() {
         assert!(states.truth.foot_force[robot].iter().all(|force| *force > 5.0), "{:?}", states.truth.foot_force);
         assert!((states.measured.stamp[robot] - 5.0).abs() < 1e-9);
     }
+}
+
+/// Returns the mean forward velocity [m/s] and the number of falls of robots that walk over steps of 5 cm.
+fn walk_over_steps<B: Backend>(backend: B) -> (f32, usize) {
+    let (policy, _) = Policy::read(root().join("data/policies/walk_robust.safetensors")).unwrap();
+    let (walk, robots) = (Walk::new(WalkConfig::default(), &go2(), true).unwrap(), backend.num_robots());
+    let settings = TaskEnvConfig {
+        randomise: Randomisation::default(),
+        robot_sampler: None,
+        autoreset: AutoresetMode::Disabled,
+        max_episode_steps: None,
+        seed: 1,
+    };
+    let mut env = TaskEnv::new(backend, walk, settings).unwrap();
+    env.set_velocity_commands(&vec![[0.5, 0.0, 0.0]; robots]).unwrap();
+    let mut obs = env.reset(&ResetRequest::seeded(3, robots)).unwrap().to_vec();
+    let (mut runner, mut actions) = (PolicyRunner::new(&policy), vec![0.0; robots * NUM_JOINTS]);
+    let (mut has_fallen, mut velocities) = (vec![false; robots], Vec::new());
+    for _ in 0..300 {
+        runner.run(&obs, &mut actions);
+        let batch = env.step(&actions).unwrap();
+        obs.copy_from_slice(&batch.obs);
+        for robot in 0..robots {
+            has_fallen[robot] |= batch.terminated[robot];
+        }
+        if has_fallen.iter().any(|has_fallen| *has_fallen) {
+            let fallen: Vec<bool> = has_fallen.clone();
+            env.reset(&ResetRequest { seeds: None, mask: Some(fallen) }).unwrap();
+        }
+        let truth = env.backend().ground_truth().unwrap();
+        velocities
+            .extend((0..robots).filter(|robot| !has_fallen[*robot]).map(|robot| truth.base_linear_velocity[robot][0]));
+    }
+    let falls = has_fallen.iter().filter(|has_fallen| **has_fallen).count();
+    (velocities.iter().sum::<f32>() / velocities.len() as f32, falls)
+}
+
+/// A step is as high as it is: before the batch engine touched the nearest point of a face, half of the robots fell at 5 cm.
+#[test]
+fn policy_walks_over_steps_as_in_the_batch_engine() {
+    let Some(python) = Interpreter::of_tests() else { return };
+    let terrain = Terrain::Steps(StepTerrain { height_m: 0.05, tread_m: 0.3, size_m: 12.0, seed: 1 });
+    let (mujoco, batch) =
+        (SimConfig { terrain, ..config() }, SimConfig { terrain, threads: 1, ..SimConfig::default() });
+    let (expected, expected_falls) = walk_over_steps(python.backend(go2(), mujoco, 16));
+    let (velocity, falls) = walk_over_steps(BatchBackend::new(go2(), batch, 16).unwrap());
+    assert!(expected > 0.4 && (velocity - expected).abs() < 0.06, "{velocity} m/s instead of {expected}");
+    assert!(falls.abs_diff(expected_falls) <= 3, "{falls} falls instead of {expected_falls}");
 }
 
 #[test]

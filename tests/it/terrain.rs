@@ -3,12 +3,15 @@
 use glam::{Quat, Vec3};
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_env_server::{Config, EnvFactory, SimEnvFactory};
-use twinstep_envs::TaskConfig;
+use twinstep_envs::{Randomisation, TaskConfig, TaskEnv, TaskEnvConfig, Walk, WalkConfig};
 use twinstep_model::{
-    AutoresetMode, Command, Ground, InitialState, NUM_LEGS, Pose, ResetRequest, ShapeKind, Simulator, VecEnv,
-    body_poses, frames, go2,
+    AutoresetMode, Backend, Command, Ground, InitialState, NUM_LEGS, Pose, ResetRequest, Scene, SceneShape, ShapeKind,
+    Simulator, VecEnv, body_poses, frames, go2,
 };
-use twinstep_sim::{BatchBackend, Engine, RapierBackend, RoughTerrain, SimConfig, StepTerrain, Terrain};
+use twinstep_policy::{Policy, PolicyRunner};
+use twinstep_sim::{BatchBackend, CourseTerrain, Engine, RapierBackend, RoughTerrain, SimConfig, StepTerrain, Terrain};
+
+use twinstep_tests::python::root;
 
 use crate::remote::{self, config, start};
 
@@ -131,6 +134,76 @@ fn does_not_fall_through<B: Simulator>(make: Make<B>, min_foot_from_1_m: f32, mi
         }
         assert!(lowest_trunk > min_trunk, "dropped from {height} m: the trunk was {lowest_trunk} m above the ground");
         assert!(lowest_foot > min_foot, "dropped from {height} m: a foot was {lowest_foot} m above the ground");
+    }
+}
+
+fn course() -> Terrain {
+    Terrain::Course(CourseTerrain { stairs_m: Some([0.1, 0.2]), levels: 2, seed: 1, ..CourseTerrain::default() })
+}
+
+/// Robots of a policy that does not know stairs run against them; no foot may get into a face.
+#[test]
+fn foot_that_is_driven_against_stairs_stays_outside_of_them() {
+    let (policy, _) = Policy::read(root().join("data/policies/walk_robust.safetensors")).unwrap();
+    let sim = SimConfig { terrain: course(), threads: 1, ..SimConfig::default() };
+    let walk = Walk::new(WalkConfig { min_base_height_m: Some(-10.0), ..WalkConfig::default() }, &go2(), true).unwrap();
+    let settings = TaskEnvConfig {
+        randomise: Randomisation::default(),
+        robot_sampler: None,
+        autoreset: AutoresetMode::SameStep,
+        max_episode_steps: None,
+        seed: 1,
+    };
+    let mut env = TaskEnv::new(BatchBackend::new(go2(), sim, 8).unwrap(), walk, settings).unwrap();
+    env.set_velocity_commands(&[[0.8, 0.0, 0.0]; 8]).unwrap();
+    let mut obs = env.reset(&ResetRequest::seeded(1, 8)).unwrap().to_vec();
+    let (mut runner, mut actions) = (PolicyRunner::new(&policy), vec![0.0; 8 * 12]);
+    let ground = env.backend().ground();
+    let mut lowest = f32::INFINITY;
+    for _ in 0..400 {
+        runner.run(&obs, &mut actions);
+        obs.copy_from_slice(&env.step(&actions).unwrap().obs);
+        for robot in 0..8 {
+            let scene = env.scene(robot).unwrap();
+            for [x, y, z] in foot_centres_of(&scene) {
+                lowest = lowest.min(z - ground.height(x, y));
+            }
+        }
+    }
+    assert!(lowest > 0.0, "the centre of a foot was {lowest} m from above the ground");
+    assert!(lowest < 0.03, "no foot has touched the ground");
+}
+
+/// Returns the centres of the feet in a scene [m].
+fn foot_centres_of(scene: &Scene) -> Vec<[f32; 3]> {
+    let feet = scene.shapes.iter().filter(|shape| shape.kind == ShapeKind::Sphere && shape.body > 0);
+    let centre = |shape: &SceneShape| {
+        let [x, y, z, qw, qx, qy, qz] = scene.pose[shape.body as usize];
+        let world_from_body = Pose { position: Vec3::new(x, y, z), rotation: Quat::from_xyzw(qx, qy, qz, qw) };
+        let [x, y, z, ..] = shape.offset;
+        world_from_body.transform(Vec3::new(x, y, z)).to_array()
+    };
+    feet.map(centre).collect()
+}
+
+#[test]
+fn robots_start_on_the_patches_of_a_course_and_stand_there() {
+    let config =
+        Config { sim: SimConfig { terrain: course(), ..SimConfig::default() }, ..config(TaskConfig::default()) };
+    let mut env = SimEnvFactory::new(config).unwrap().build(6, AutoresetMode::NextStep, None).unwrap();
+    env.reset(&ResetRequest::seeded(1, 6)).unwrap();
+    let (ground, level) = (course().ground(), env.mean_level().unwrap());
+    assert!((0.0..=1.0).contains(&level), "{level}");
+    for _ in 0..50 {
+        assert!(!env.step(&[0.0; 72]).unwrap().terminated.contains(&true), "a standing robot does not fall");
+    }
+    let patches = ground.patches.unwrap();
+    for robot in 0..6 {
+        let [x, y, z, ..] = env.scene(robot).unwrap().pose[0];
+        let at = |level: usize| patches.centre(level, robot % 2);
+        let nearest = (0..2).map(|level| (at(level)[0] - x).hypot(at(level)[1] - y)).fold(f32::INFINITY, f32::min);
+        assert!(nearest < 0.1, "robot {robot} is {nearest} m from the middle of its patch");
+        assert!((0.25..0.4).contains(&(z - ground.height(x, y))), "robot {robot}: {z}");
     }
 }
 

@@ -4,15 +4,17 @@ use std::path::PathBuf;
 
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
-use twinstep_envs::{ControlledRobot, Gait, JumpConfig, TaskConfig, TrackConfig};
+use twinstep_agent::read_contract;
+use twinstep_effects::ControlTable;
+use twinstep_envs::{ControlledRobot, Gait, JumpConfig, Randomisation, TaskConfig, TrackConfig, WalkConfig};
 use twinstep_measures::{
-    AttitudeErrors, AttitudeFollowing, CONDITION_NAMES, Condition, Evaluation, GaitFollowing, JUMP_S, Jumping, Measure,
-    MeasureError, Run, Tracking, Walking, check_spec, conditions, measure,
+    AttitudeErrors, AttitudeFollowing, CONDITION_NAMES, Condition, CourseWalking, Evaluation, GaitFollowing, JUMP_S,
+    Jumping, KindOfGround, Measure, MeasureError, Run, Tracking, Walking, check_spec, conditions, measure,
 };
 use twinstep_model::{EnvError, EnvSpec, ResetRequest, VecEnv};
 use twinstep_policy::{Policy, PolicyRunner};
 use twinstep_report::film_strip;
-use twinstep_sim::{Engine, SimConfig};
+use twinstep_sim::{CourseTerrain, Engine, SimConfig, Terrain};
 
 use crate::exit::{CommandResult, Failure, Signals, input};
 use crate::measure_tables::{self, ByGait, ByPath, ByTarget, Row};
@@ -41,6 +43,10 @@ const FILM_STEPS: usize = 4;
 ///   delay     commands arrive 0 to 20 ms late
 ///   noise     errors of the sensors as in Isaac Lab
 ///   robust    robots, steps, pushes and delay at once
+///
+/// --course shows how steep and high a ground a policy of `walk` masters instead: slopes, stairs,
+/// obstacles, waves and rough ground at ten levels each. Every robot starts in the middle of a
+/// patch of 8 m and walks straight on at 0.8 m/s; the table has the share that arrive at its end.
 ///
 /// Without --engine the nominal robot is also simulated in rapier, which no policy is trained in.
 /// `--engine mujoco` needs `pip install "twinstep[mujoco]"` and simulates a thousand env-steps per
@@ -74,12 +80,20 @@ pub struct Args {
     /// Write a film strip (SVG) of a robot with the first condition, 0.08 s between two frames.
     #[arg(long, value_name = "FILE")]
     film: Option<PathBuf>,
+    /// Walk over slopes, stairs, obstacles, waves and rough ground instead.
+    #[arg(long, conflicts_with_all = ["condition", "seconds"])]
+    course: bool,
     /// Print one JSON object on stdout.
     #[arg(long)]
     json: bool,
 }
 
 impl Args {
+    /// Returns gains, default pose and action scale of the policy for the ideal Go2; a model file has its own.
+    fn contract(&self) -> Option<ControlTable> {
+        if self.model.is_some() { None } else { read_contract(&self.policy).ok() }
+    }
+
     /// Returns the conditions that are wanted.
     fn conditions(&self) -> Vec<Condition> {
         let is_wanted = |condition: &Condition| self.condition.iter().any(|name| name == condition.name);
@@ -91,7 +105,7 @@ impl Args {
 fn env(condition: &Condition, args: &Args, task: TaskConfig, robots: usize) -> Result<Box<dyn VecEnv>, Failure> {
     let sim = SimConfig { engine: condition.engine, terrain: condition.terrain, ..SimConfig::default() };
     let (model, randomise) = (args.model.clone(), condition.randomise);
-    let config = TrainConfig { model, task, sim, randomise, ..TrainConfig::default() };
+    let config = TrainConfig { model, task, sim, randomise, control: args.contract(), ..TrainConfig::default() };
     Ok(config.envs(robots, 1, 0)?.remove(0))
 }
 
@@ -113,6 +127,16 @@ pub fn run(args: &Args) -> CommandResult {
     }
     let who = (args, &policy, &signals);
     let text = match &task {
+        TaskConfig::Walk(trained) if args.course => {
+            let kinds = course(who, trained)?;
+            if args.json { json(args, &kinds) } else { measure_tables::course(&kinds) }
+        }
+        other if args.course => {
+            return Err(Failure::Input(miette::miette!(
+                "`--course` is for policies of `walk`, and this is one of `{}`",
+                other.name()
+            )));
+        }
         TaskConfig::Track(_) => {
             let rows = tracking(who)?;
             if args.json { json(args, &rows) } else { measure_tables::tracking(args.robots, args.seconds, &rows) }
@@ -129,8 +153,8 @@ pub fn run(args: &Args) -> CommandResult {
             let rows = attitudes(who)?;
             if args.json { json(args, &rows) } else { measure_tables::attitude(args.robots, args.seconds, &rows) }
         }
-        _ => {
-            let rows = walking(who)?;
+        task => {
+            let rows = walking(who, task)?;
             if args.json {
                 json(args, &rows)
             } else {
@@ -143,12 +167,13 @@ pub fn run(args: &Args) -> CommandResult {
     Ok(())
 }
 
-/// Returns the task of a policy: that of `jump` with the targets of its training, and the others with default settings.
+/// Returns the task of a policy: that of `jump` with the targets of its training, and the others with default settings, but for
+/// what they observe.
 fn task(policy: &Policy, trained_with: &str) -> TaskConfig {
     let trained = TrainConfig::parse(trained_with, "the policy's config").map(|config| config.task);
     match (policy.spec.task.as_str(), trained) {
         ("jump", Ok(task @ TaskConfig::Jump(_))) => task,
-        (name, _) => TaskConfig::named(name).unwrap_or_default(),
+        _ => TaskConfig::of_policy(&policy.spec).unwrap_or_default(),
     }
 }
 
@@ -201,13 +226,29 @@ fn run_of(args: &Args) -> Run {
 }
 
 /// Evaluates the policy by velocity commands under each condition.
-fn walking(who: Who) -> Result<Vec<Row<Evaluation>>, Failure> {
+fn walking(who: Who, task: &TaskConfig) -> Result<Vec<Row<Evaluation>>, Failure> {
     let args = who.0;
-    let robot = TrainConfig { model: args.model.clone(), ..TrainConfig::default() }.robots(1)?.control();
+    let robot = TrainConfig { model: args.model.clone(), control: args.contract(), ..TrainConfig::default() };
+    let robot = robot.robots(1)?.control();
     let ControlledRobot { feet, torque_limits, .. } = &robot;
-    let tasks = |_: &Condition| vec![(TaskConfig::default(), ())];
+    let tasks = |_: &Condition| vec![(task.clone(), ())];
     let new = |spec: &EnvSpec, robots: usize, (): &()| Walking::new(spec, robots, feet, torque_limits);
     Ok(mapped(measured(who, &args.conditions(), &tasks, run_of(args), new)?, |mut found| found.remove(0)))
+}
+
+/// Evaluates the policy on a course.
+fn course(who: Who, trained: &WalkConfig) -> Result<Vec<KindOfGround>, Failure> {
+    let (args, terrain) = (who.0, CourseTerrain::FULL);
+    let condition = Condition {
+        name: "course",
+        engine: args.engine.unwrap_or(Engine::Batch),
+        randomise: Randomisation::default(),
+        terrain: Terrain::Course(terrain),
+    };
+    let tasks = |_: &Condition| vec![(TaskConfig::Walk(CourseWalking::task(trained)), ())];
+    let new = |_: &EnvSpec, robots: usize, (): &()| Ok(CourseWalking::new(terrain, robots));
+    let run = Run { seconds: CourseWalking::SECONDS, ..run_of(args) };
+    Ok(measured(who, &[condition], &tasks, run, new)?.remove(0).found.remove(0))
 }
 
 /// Evaluates the policy along each path under each condition.

@@ -4,9 +4,10 @@ use std::fmt::Write;
 
 use serde::Serialize;
 use twinstep_measures::{
-    AttitudeErrors, Evaluation, GaitMotion, JUMP_S, Landings, PoseErrors, SpeedBin, Tracking, TrackingErrors,
+    AttitudeErrors, Evaluation, GaitMotion, JUMP_S, KindOfGround, Landings, Level, PoseErrors, SpeedBin, Tracking,
+    TrackingErrors,
 };
-use twinstep_sim::Engine;
+use twinstep_sim::{Engine, PatchKind};
 
 /// What was measured under a condition.
 #[derive(Serialize)]
@@ -44,6 +45,26 @@ pub struct ByTarget {
 /// Returns the name of an engine in tables.
 fn name(engine: Engine) -> String {
     format!("{engine:?}").to_lowercase()
+}
+
+/// Returns the shares of robots that leave their patch of a course as a table.
+pub fn course(kinds: &[KindOfGround]) -> String {
+    let mut text =
+        "Share of the robots that arrive, by kind and level; below it the angle [deg] or height [cm]\n".to_owned();
+    for KindOfGround { kind, passed, levels } in kinds {
+        let name = format!("{kind:?}");
+        let _ = writeln!(text, "\n{name:11} {passed:2} levels passed (80 %)");
+        let unit = |size: f32| match kind {
+            PatchKind::SlopeUp | PatchKind::SlopeDown => size.to_degrees(),
+            _ => 100.0 * size,
+        };
+        let share = |level: &Level| 100.0 * level.arrived as f64 / level.robots.max(1) as f64;
+        let row = |cells: &mut dyn Iterator<Item = String>| cells.collect::<Vec<_>>().join(" ");
+        let shares = row(&mut levels.iter().map(|level| format!("{:5.0} %", share(level))));
+        let sizes = row(&mut levels.iter().map(|level| format!("{:7.1}", unit(level.size))));
+        let _ = writeln!(text, "  {shares}\n {sizes}");
+    }
+    text
 }
 
 /// Returns the evaluations as a table.

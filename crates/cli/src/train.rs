@@ -20,6 +20,8 @@ use crate::web_view::{Page, ViewArgs};
 
 /// The checkpoint before the last one.
 const PREVIOUS: &str = "checkpoint.previous.safetensors";
+/// Settings of a training on rough ground, slopes and stairs.
+const TERRAIN: &str = include_str!("../../../data/policies/walk_terrain.toml");
 /// Interval at which a running training is saved.
 const SAVE_EVERY: Duration = Duration::from_secs(10);
 
@@ -57,6 +59,10 @@ pub struct Args {
     /// Config file (TOML) with [task], [sim], [randomise] and [train]. Flags override its values.
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
+    /// Learn to walk over slopes, stairs, obstacles, waves and rough ground, with the settings of
+    /// data/policies/walk_terrain.toml. The progress names the mean level that the robots have reached.
+    #[arg(long, conflicts_with_all = ["config", "endpoint", "resume"])]
+    terrain: bool,
     /// Model file of the robot, or the name of one in this program, such as spot (docs/robots.md). Default: the ideal Go2.
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
@@ -165,6 +171,7 @@ impl Args {
             task: Some("walk".to_owned()),
             out,
             config: None,
+            terrain: false,
             model: None,
             randomise_effects: false,
             seed,
@@ -219,7 +226,11 @@ impl Args {
     }
 
     fn config(&self) -> Result<TrainConfig, Failure> {
-        let mut config = self.config.as_deref().map_or_else(|| Ok(TrainConfig::default()), TrainConfig::load)?;
+        let mut config = match &self.config {
+            Some(path) => TrainConfig::load(path)?,
+            None if self.terrain => TrainConfig::parse(TERRAIN, "data/policies/walk_terrain.toml")?,
+            None => TrainConfig::default(),
+        };
         if let Some(task) = self.task.as_deref().filter(|task| *task != config.task.name()) {
             if config.task != TaskConfig::default() {
                 let of_config = config.task.name();
@@ -492,7 +503,8 @@ fn other_spec(earlier: &EnvSpec, spec: &EnvSpec) -> Failure {
 fn progress_text(point: &CurvePoint) -> String {
     let error = |value: Option<f64>, unit: &str| value.map_or(String::new(), |value| format!("{value:.2} {unit}, "));
     format!(
-        "errors {}{}falls/min {:.1}, reward {:.3}",
+        "{}errors {}{}falls/min {:.1}, reward {:.3}",
+        point.mean_level.map_or(String::new(), |level| format!("level {level:.1}, ")),
         error(point.velocity_rms, "m/s"),
         error(point.yaw_rate_rms, "rad/s"),
         point.falls_per_minute,

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 use twinstep_effects::parse_toml;
 
 use serde::{Deserialize, Serialize};
+use twinstep_effects::ControlTable;
 use twinstep_env_server::{
     AnyEnvFactory, Config, ConfigFileError, EnvFactory, ServerConfig, SimEnvFactory, is_of_tree,
 };
@@ -33,6 +34,9 @@ pub struct TrainConfig {
     pub sim: SimConfig,
     /// Domain randomisation.
     pub randomise: Randomisation,
+    /// Gains, default pose and action scale in place of those of the model file.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub control: Option<ControlTable>,
     /// Settings of the learner.
     pub train: PpoConfig,
 }
@@ -44,6 +48,7 @@ impl Default for TrainConfig {
             task: TaskConfig::default(),
             sim: SimConfig { physics_hz: Some(TRAINING_PHYSICS_HZ), ..SimConfig::default() },
             randomise: Randomisation::default(),
+            control: None,
             train: PpoConfig::default(),
         }
     }
@@ -105,7 +110,7 @@ impl TrainConfig {
             task: self.task.clone(),
             sim: SimConfig { threads, ..self.sim },
             randomise: self.randomise,
-            control: None,
+            control: self.control.clone(),
         };
         config.check().map_err(input)?;
         Ok(config)

@@ -130,7 +130,8 @@ fn pose(policy: &Policy, config: &TrainConfig, signals: &Signals) -> Result<Pose
 
 /// Returns the training's robot with default physics.
 fn fresh(config: &TrainConfig, task: TaskConfig) -> TrainConfig {
-    TrainConfig { model: config.model.clone(), task, sim: SimConfig::default(), ..TrainConfig::default() }
+    let (model, control) = (config.model.clone(), config.control.clone());
+    TrainConfig { model, control, task, sim: SimConfig::default(), ..TrainConfig::default() }
 }
 
 /// Returns the table of an evaluation.

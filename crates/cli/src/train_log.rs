@@ -61,7 +61,7 @@ fn rows_until(path: &Path, env_steps: u64) -> std::io::Result<String> {
 }
 
 /// Names of the columns before the reward terms.
-const NAMES: [&str; 15] = [
+const NAMES: [&str; 16] = [
     "iteration",
     "env_steps",
     "seconds",
@@ -69,6 +69,7 @@ const NAMES: [&str; 15] = [
     "velocity_rms",
     "yaw_rate_rms",
     "falls_per_minute",
+    "mean_level",
     "surrogate",
     "value_loss",
     "kl",
@@ -79,7 +80,7 @@ const NAMES: [&str; 15] = [
     "update_s",
 ];
 
-fn values(iteration: &Iteration, point: &CurvePoint) -> [f64; 15] {
+fn values(iteration: &Iteration, point: &CurvePoint) -> [f64; 16] {
     [
         iteration.iteration as f64,
         iteration.env_steps as f64,
@@ -88,6 +89,7 @@ fn values(iteration: &Iteration, point: &CurvePoint) -> [f64; 15] {
         point.velocity_rms.unwrap_or(f64::NAN),
         point.yaw_rate_rms.unwrap_or(f64::NAN),
         point.falls_per_minute,
+        point.mean_level.unwrap_or(f64::NAN),
         iteration.surrogate,
         iteration.value_loss,
         iteration.kl,
@@ -111,6 +113,7 @@ pub fn curve_point(iteration: &Iteration, policy_dt: f64, seconds: f64) -> Curve
         velocity_rms: rms.map(|[velocity, _]| velocity),
         yaw_rate_rms: rms.map(|[_, yaw_rate]| yaw_rate),
         falls_per_minute: statistics.falls as f64 / (steps * policy_dt / 60.0),
+        mean_level: statistics.mean_level(),
     }
 }
 

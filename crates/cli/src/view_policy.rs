@@ -3,7 +3,8 @@
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use twinstep_agent::{BoundPolicy, LoadedPolicy, PolicyInput};
+use twinstep_agent::{BoundPolicy, LoadedPolicy, PolicyInput, read_contract};
+use twinstep_effects::ControlTable;
 use twinstep_env_server::{Config, EnvFactory, ServerConfig, SimEnvFactory};
 use twinstep_envs::TaskConfig;
 use twinstep_model::{AutoresetMode, ResetRequest, VecEnv};
@@ -71,7 +72,10 @@ pub fn motion(
 fn start(path: &Path, model: Option<&Path>, args: &WalkArgs) -> Result<(PolicyWalk, SceneInfo), Failure> {
     let robots = usize::from(args.robots);
     let read = || LoadedPolicy::read(path, args.mapping.as_deref()).map_err(input);
-    let factory = factory(&read()?, model, args.engine, robots)?;
+    let policy = read()?;
+    // A policy of this program states its gains; those of another one are in its mapping, and a model file has its own.
+    let contract = policy.spec().filter(|_| model.is_none()).and_then(|_| read_contract(path).ok());
+    let factory = factory(&policy, contract, model, args.engine, robots)?;
     let mut env = factory.build(robots, AutoresetMode::SameStep, Some(u32::MAX)).map_err(input)?;
     let load = || read()?.bind(env.spec()).map_err(input);
     let policies = (0..robots).map(|_| load()).collect::<Result<Vec<_>, _>>()?;
@@ -89,13 +93,15 @@ fn start(path: &Path, model: Option<&Path>, args: &WalkArgs) -> Result<(PolicyWa
 /// Returns the factory of the environments of the policy's task.
 fn factory(
     policy: &LoadedPolicy,
+    control: Option<ControlTable>,
     model: Option<&Path>,
     engine: Engine,
     robots: usize,
 ) -> Result<SimEnvFactory, Failure> {
-    let task = policy.spec().and_then(|spec| TaskConfig::named(&spec.task)).unwrap_or_default();
+    let task = policy.spec().and_then(TaskConfig::of_policy).unwrap_or_default();
     let config = Config {
         task,
+        control,
         server: ServerConfig { model: model.map(Path::to_owned), envs: robots, ..ServerConfig::default() },
         sim: SimConfig { engine, threads: 1, ..SimConfig::default() },
         ..Config::default()

@@ -47,6 +47,10 @@ pub struct EpisodeStart<R> {
     pub actuator_seed: u64,
     /// Joint position [rad].
     pub q: Vec<f32>,
+    /// Source of the place on the ground.
+    pub place: Stream,
+    /// True for the first episode with a seed.
+    pub is_first: bool,
 }
 
 /// Reward and end flags of a policy step.
@@ -124,6 +128,7 @@ impl<S: Default> Episode<S> {
         self.noise = stream(self.seed, "noise", self.episode_index);
         self.pushes = stream(self.seed, "push", self.episode_index);
         self.steps_to_push = randomise.sample_push_steps(task.spec().policy_dt, &mut self.pushes);
+        let (place, is_first) = (stream(self.seed, "place", self.episode_index), self.episode_index == 0);
         let robot = sample(&mut effects, &mut self.random);
         let (q, state) = task.start(&mut self.random);
         self.state = state;
@@ -134,7 +139,7 @@ impl<S: Default> Episode<S> {
         self.terms.fill(0.0);
         self.term_sums.fill(0.0);
         self.action.fill(0.0);
-        EpisodeStart { robot, actuator_seed, q }
+        EpisodeStart { robot, actuator_seed, q, place, is_first }
     }
 
     /// Returns the velocity that a push adds before this step, in the world frame [m/s]. `None`: there is no push.

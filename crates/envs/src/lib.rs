@@ -16,6 +16,7 @@ mod check;
 mod config;
 mod controlled_robot;
 mod counter;
+mod course;
 mod episode;
 mod feet;
 mod observation;
@@ -37,7 +38,7 @@ pub use observation::{CRITIC_OBS_LEN, OBS_LEN, base_spec, observe, observe_privi
 pub use observation_noise::{NoisyEntry, ObservationNoise, add_noise};
 pub use path::{GroundPose, Path, PathShape};
 pub use randomise::Randomisation;
-pub use task::{RobotView, Step, Task, Truth};
+pub use task::{RobotView, Step, Task, Truth, observe_next, repeat_first_frame};
 pub use task_env::{TaskEnv, TaskEnvConfig};
 pub use tasks::{
     Attitude, AttitudeConfig, ExploreConfig, Gait, GaitConfig, GaitTask, Jump, JumpConfig, PoseConfig, PoseState,

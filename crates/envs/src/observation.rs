@@ -89,6 +89,49 @@ pub(crate) fn privileged_fields_of(feet: &[&str]) -> Vec<SpecField> {
     ]
 }
 
+/// Returns the number of privileged entries of a robot with this number of feet.
+pub(crate) fn privileged_len(feet: usize) -> usize {
+    7 + feet
+}
+
+/// Returns the fields of this number of frames: the present one, and those of `n` policy steps before, whose names end in `_n`.
+pub(crate) fn framed(present: &[SpecField], frames: usize) -> Vec<SpecField> {
+    let earlier = |field: &SpecField, before: usize| SpecField {
+        name: format!("{}_{before}", field.name),
+        description: format!("{}, {before} policy steps before", field.description),
+        ..field.clone()
+    };
+    let earlier = (1..frames).flat_map(|before| present.iter().map(move |field| earlier(field, before)));
+    present.iter().cloned().chain(earlier).collect()
+}
+
+/// Points at which a critic sees the ground, by their distances from the base along its heading and to the left [m].
+const GROUND_POINTS: [&[f32]; 2] = [&[-0.6, -0.4, -0.2, 0.0, 0.2, 0.4, 0.6], &[-0.4, -0.2, 0.0, 0.2, 0.4]];
+
+/// Returns the field of the heights of the ground, which [`observe_ground`] writes.
+pub(crate) fn ground_heights_field() -> SpecField {
+    let points = GROUND_POINTS[0].len() * GROUND_POINTS[1].len();
+    field(
+        "ground_depth",
+        points,
+        "m",
+        2.0,
+        "depth of the ground below the base, on a grid along its heading: rows from -0.6 to 0.6 m forward, columns from -0.4 to 0.4 m to the left",
+    )
+}
+
+/// Writes the depth of the ground below the base at the points around it.
+pub(crate) fn observe_ground(robot: &RobotView, truth: &Truth, obs: &mut [f32]) {
+    let forward = frames::world_from_base(robot.orientation) * Vec3::X;
+    let length = forward.x.hypot(forward.y).max(1e-3);
+    let [cos, sin] = [forward.x / length, forward.y / length];
+    let [x, y, z] = truth.base_position;
+    let points = GROUND_POINTS[0].iter().flat_map(|along| GROUND_POINTS[1].iter().map(move |across| (along, across)));
+    let depths = points
+        .map(|(along, across)| z - robot.ground.height(x + cos * along - sin * across, y + sin * along + cos * across));
+    write_clipped(obs, depths, 2.0);
+}
+
 /// Returns a field whose entries are within ±`bound`.
 pub(crate) fn field(name: &str, size: usize, unit: &str, bound: f32, text: &str) -> SpecField {
     SpecField {
@@ -129,10 +172,19 @@ pub fn linear_velocity_in_base(robot: &RobotView, truth: &Truth) -> Vec3 {
     frames::world_from_base(robot.orientation).inverse() * Vec3::from(truth.base_linear_velocity)
 }
 
-/// Returns the height of the base above the ground under it [m].
+/// Half the side of the square under the base whose mean height counts [m].
+const UNDER_BASE: f32 = 0.15;
+
+/// Returns the height of the base above the ground under it [m]: above the mean of nine points, so that it does not jump by a step
+/// at its edge.
 pub fn base_height(robot: &RobotView, truth: &Truth) -> f32 {
     let [x, y, z] = truth.base_position;
-    z - robot.ground.height(x, y)
+    if robot.ground.height_field.is_none() {
+        return z - robot.ground.height(x, y);
+    }
+    let offsets = [-UNDER_BASE, 0.0, UNDER_BASE];
+    let heights = offsets.into_iter().flat_map(|dx| offsets.map(|dy| robot.ground.height(x + dx, y + dy)));
+    z - heights.sum::<f32>() / 9.0
 }
 
 fn write_clipped(entries: &mut [f32], values: impl IntoIterator<Item = f32>, bound: f32) {

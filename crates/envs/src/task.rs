@@ -16,7 +16,12 @@ pub trait Task: Send {
     /// Starts an episode. Returns the initial joint positions [rad] and the state.
     fn start(&self, random: &mut Stream) -> (Vec<f32>, Self::State);
 
-    /// Writes the observation of group `policy`. `action` is the last action, clipped to [−1, 1]; 0 after a reset.
+    /// Returns how many frames the observation has: the present one, and earlier ones, which [`crate::TaskEnv`] keeps.
+    fn frames(&self) -> usize {
+        1
+    }
+
+    /// Writes the present frame of the observation of group `policy`. `action` is the last action, clipped to [−1, 1]; 0 after a reset.
     fn observe(&self, state: &Self::State, robot: &RobotView, action: &[f32], obs: &mut [f32]);
 
     /// Writes the observation of group `critic`. Called only if the spec has one.
@@ -38,6 +43,19 @@ pub trait Task: Send {
     /// Sets the gait command for the rest of the episode. A task with `step_frequency` and `phase_offset` in its
     /// observation has one.
     fn set_gait_command(&self, _state: &mut Self::State, _command: GaitCommand) {}
+}
+
+/// Writes the observation of group `policy`: its frames move back by one, and the present one comes first.
+pub fn observe_next<T: Task>(task: &T, state: &T::State, robot: &RobotView, action: &[f32], obs: &mut [f32]) {
+    let frame = obs.len() / task.frames();
+    obs.copy_within(..obs.len() - frame, frame);
+    task.observe(state, robot, action, &mut obs[..frame]);
+}
+
+/// Makes all frames of an observation like the present one: a new episode has no earlier ones.
+pub fn repeat_first_frame(task: &impl Task, obs: &mut [f32]) {
+    let (first, earlier) = obs.split_at_mut(obs.len() / task.frames());
+    earlier.chunks_exact_mut(first.len()).for_each(|frame| frame.copy_from_slice(first));
 }
 
 /// One robot after a reset or a step.

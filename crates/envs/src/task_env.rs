@@ -8,9 +8,10 @@ use twinstep_model::{
     StepBatch, Stream, VecEnv, VelocityCommand, frames, stream,
 };
 
+use crate::course::Course;
 use crate::episode::{Episode, StepOutcome};
 use crate::observation_noise::{NoisyEntry, add_noise};
-use crate::task::{RobotView, Task};
+use crate::task::{RobotView, Task, observe_next, repeat_first_frame};
 use crate::{ConfigError, Randomisation};
 
 /// Initial height of the lowest foot above the ground [m].
@@ -40,6 +41,7 @@ pub struct TaskEnv<B: Backend, T: Task> {
     noise: Vec<NoisyEntry>,
     robots: Option<RobotSampler>,
     ground: Ground,
+    course: Option<Course>,
     autoreset: AutoresetMode,
     episodes: Vec<Episode<T::State>>,
     commands: Vec<Command>,
@@ -71,6 +73,7 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
             noise: randomise.noise.entries(&spec),
             randomise,
             robots,
+            course: backend.ground().patches.map(|patches| Course::new(patches, num_envs)),
             ground: backend.ground(),
             autoreset,
             episodes: (0..num_envs as u64).map(not_started).collect(),
@@ -104,18 +107,22 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
             self.backend.prepare_reset(cause)?;
         }
         for env in envs {
-            let Self { task, backend, randomise, robots, .. } = self;
+            let Self { task, backend, randomise, robots, course, .. } = self;
             let nominal = backend.robot();
-            let start = self.episodes[*env].start(task, randomise, |effects, random| {
+            let mut start = self.episodes[*env].start(task, randomise, |effects, random| {
                 let sampled = robots.as_ref().map(|sampler| sampler.sample(effects));
                 randomise.sample(sampled.as_ref().unwrap_or(nominal), random).or(sampled)
             });
             let q = per_joint(&start.q);
+            let walked_to = backend.ground_truth().filter(|_| !start.is_first).map(|truth| truth.base_position[*env]);
+            let place = course
+                .as_mut()
+                .map_or([0.0; 3], |course| course.start(*env, walked_to.map(|[x, y, _]| [x, y]), &mut start.place));
             self.episodes[*env].set_commands(task, &self.agent_commands, *env);
             self.commands[*env].q = q;
             let initial_state = InitialState {
                 actuator_seed: start.actuator_seed,
-                ..InitialState::standing_on(&self.ground, backend.robot(), q, START_CLEARANCE)
+                ..InitialState::standing_at(&self.ground, backend.robot(), q, START_CLEARANCE, place)
             };
             match start.robot {
                 Some(robot) => backend.reset_with_model(*env, &robot, &initial_state)?,
@@ -123,6 +130,7 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
             }
             self.follow_robot(*env);
             self.observe(*env);
+            repeat_first_frame(&self.task, row(&mut self.batch.obs, *env, self.spec.obs_len()));
         }
         Ok(())
     }
@@ -193,7 +201,7 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
         let episode = &mut episodes[env];
         let robot = view(backend, ground, env);
         let obs = row(&mut batch.obs, env, spec.obs_len());
-        task.observe(&episode.state, &robot, &episode.action, obs);
+        observe_next(task, &episode.state, &robot, &episode.action, obs);
         add_noise(noise, obs, &mut episode.noise);
         if !spec.critic_observation.is_empty() {
             task.observe_critic(&episode.state, &robot, row(&mut batch.critic_obs, env, spec.critic_obs_len()));
@@ -247,7 +255,10 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
             let mut outcome = StepOutcome { truncated: self.episodes[env].diverged, ..StepOutcome::default() };
             if self.active[env] {
                 self.follow_robot(env);
-                let Self { backend, task, spec, ground, episodes, .. } = self;
+                let Self { backend, task, spec, ground, episodes, course, .. } = self;
+                if let (Some(course), Some([x, y, _])) = (course, task.velocity_command(&episodes[env].state)) {
+                    course.command(env, x.hypot(y) * spec.policy_dt as f32);
+                }
                 let robot = view(backend, ground, env);
                 outcome = episodes[env].evaluate_step(task, robot, spec.max_episode_steps);
                 if let Some(stop) = backend.real_time().and_then(|report| report.stop.as_ref()) {
@@ -342,6 +353,10 @@ impl<B: Backend, T: Task> VecEnv for TaskEnv<B, T> {
 
     fn critic_obs(&self) -> &[f32] {
         &self.batch.critic_obs
+    }
+
+    fn mean_level(&self) -> Option<f64> {
+        self.course.as_ref().map(Course::mean_level)
     }
 
     fn set_velocity_commands(&mut self, commands: &[VelocityCommand]) -> Result<(), EnvError> {

@@ -115,6 +115,9 @@ impl Group {
         std::mem::swap(&mut segment.actions, &mut trajectory.actions);
         std::mem::swap(&mut segment.log_probs, &mut trajectory.log_prob);
         self.statistics.add(trajectory);
+        if let Some(level) = collector.mean_level() {
+            self.statistics.add_level(level, collector.num_envs());
+        }
         let last_features = self.normalise(behaviour);
         self.estimate_advantages(behaviour, &last_features);
         Ok(())

@@ -23,6 +23,8 @@ pub struct Statistics {
     pub velocity_error: f64,
     /// Sum of the squared error of the yaw rate [rad²/s²].
     pub yaw_rate_error: f64,
+    /// Sum of the levels of robots on a course, and their number.
+    pub levels: [f64; 2],
     layout: Option<VelocityLayout>,
 }
 
@@ -82,6 +84,7 @@ impl Statistics {
             velocity_steps: 0,
             velocity_error: 0.0,
             yaw_rate_error: 0.0,
+            levels: [0.0; 2],
             layout: VelocityLayout::new(spec),
         }
     }
@@ -111,6 +114,18 @@ impl Statistics {
         }
     }
 
+    /// Adds the mean level of robots on a course.
+    pub fn add_level(&mut self, mean_level: f64, robots: usize) {
+        self.levels[0] += mean_level * robots as f64;
+        self.levels[1] += robots as f64;
+    }
+
+    /// Returns the mean level of the robots on a course; the first is 0. `None` without a course.
+    pub fn mean_level(&self) -> Option<f64> {
+        let [sum, robots] = self.levels;
+        (robots > 0.0).then(|| sum / robots)
+    }
+
     /// Adds the sums of other steps.
     pub fn merge(&mut self, other: &Self) {
         self.steps += other.steps;
@@ -121,6 +136,7 @@ impl Statistics {
         self.velocity_steps += other.velocity_steps;
         self.velocity_error += other.velocity_error;
         self.yaw_rate_error += other.yaw_rate_error;
+        self.levels = [self.levels[0] + other.levels[0], self.levels[1] + other.levels[1]];
         self.terms.iter_mut().zip(&other.terms).for_each(|(sum, term)| *sum += term);
     }
 

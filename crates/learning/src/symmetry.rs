@@ -69,7 +69,12 @@ impl Mirror {
 fn entries(field: &SpecField, is_quadruped: bool) -> Option<Vec<(usize, f32)>> {
     // Vectors change the sign of y, pseudovectors that of x and z.
     let signs = |signs: [f32; 3]| Some(signs.into_iter().enumerate().collect());
-    match field.name.as_str() {
+    // Earlier frames have the names of the present one and a number.
+    let name = match field.name.rsplit_once('_') {
+        Some((name, number)) if number.parse::<u32>().is_ok() => name,
+        _ => field.name.as_str(),
+    };
+    match name {
         "base_angular_velocity" | "true_angular_velocity" => signs([-1.0, 1.0, -1.0]),
         "projected_gravity" | "true_linear_velocity" => signs([1.0, -1.0, 1.0]),
         "velocity_command" | "no_velocity_command" | "path_velocity" | "pose_error" | "landing_target" => {
@@ -79,6 +84,10 @@ fn entries(field: &SpecField, is_quadruped: bool) -> Option<Vec<(usize, f32)>> {
         "base_height" | "phase" => Some(vec![(0, 1.0)]),
         // Stages and errors without a sign.
         "jump_stage" | "landing_error" => Some(vec![(0, 1.0), (1, 1.0)]),
+        // Rows along the heading, columns from right to left.
+        "ground_depth" => Some(
+            (0..field.size).map(|index| (index / COLUMNS * COLUMNS + COLUMNS - 1 - index % COLUMNS, 1.0)).collect(),
+        ),
         "foot_force" => is_quadruped.then(|| Leg::ALL.map(|leg| (opposite(leg) as usize, 1.0)).to_vec()),
         "joint_position" | "joint_velocity" | "previous_action" | "joint_position_offset" => {
             let joint = |joint: Joint| {
@@ -90,6 +99,9 @@ fn entries(field: &SpecField, is_quadruped: bool) -> Option<Vec<(usize, f32)>> {
         _ => None,
     }
 }
+
+/// Columns of the grid of `ground_depth`.
+const COLUMNS: usize = 5;
 
 fn opposite(leg: Leg) -> Leg {
     match leg {

@@ -2,6 +2,7 @@
 //!
 //! - [`measure`]: steps all robots of an environment with the mean action of a policy, and shows each step to a [`Measure`].
 //! - [`Walking`], [`Tracking`], [`GaitFollowing`], [`AttitudeFollowing`], [`Jumping`], [`PoseFollowing`]: a measure for each task.
+//! - [`CourseWalking`]: how steep and high a ground a policy of `walk` masters.
 //! - [`conditions`]: the robots, grounds and disturbances under which a policy is judged.
 //!
 //! A policy is judged by what the robots do and by falls, never by its reward: policies that stand still collect reward as well.
@@ -9,6 +10,7 @@
 
 mod attitude;
 mod conditions;
+mod course;
 mod gait;
 mod jump;
 mod pose;
@@ -17,6 +19,7 @@ mod walking;
 
 pub use attitude::{AttitudeErrors, AttitudeFollowing};
 pub use conditions::{CONDITION_NAMES, Condition, conditions};
+pub use course::{CourseWalking, KindOfGround, Level};
 pub use gait::{GaitFollowing, GaitMotion};
 pub use jump::{JUMP_S, Jumping, Landings};
 pub use pose::{PoseErrors, PoseFollowing};

@@ -18,11 +18,33 @@ pub struct Ground {
     pub normal: [f32; 3],
     /// Height field of rough ground. It replaces the plane everywhere: outside the grid it has the heights of its edge.
     pub height_field: Option<Arc<HeightField>>,
+    /// Patches of the height field on which robots start. Without them they start at the origin.
+    pub patches: Option<Patches>,
+}
+
+/// Square patches in a grid: a level of difficulty for each row along x, a kind of ground for each column along y.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Patches {
+    /// Corner of the first patch [m].
+    pub origin: [f32; 2],
+    /// Side length of a patch [m].
+    pub side: f32,
+    /// Number of levels.
+    pub levels: usize,
+    /// Number of kinds.
+    pub columns: usize,
+}
+
+impl Patches {
+    /// Returns the middle of a patch [m].
+    pub fn centre(&self, level: usize, column: usize) -> [f32; 2] {
+        [self.origin[0] + self.side * (level as f32 + 0.5), self.origin[1] + self.side * (column as f32 + 0.5)]
+    }
 }
 
 impl Ground {
     /// The plane z = 0.
-    pub const FLAT: Ground = Ground { point: [0.0; 3], normal: [0.0, 0.0, 1.0], height_field: None };
+    pub const FLAT: Ground = Ground { point: [0.0; 3], normal: [0.0, 0.0, 1.0], height_field: None, patches: None };
 
     /// Returns the height of the ground at (`x`, `y`) [m].
     #[inline]

@@ -42,8 +42,20 @@ impl InitialState {
     /// The collision point with the least distance to the ground is `clearance` [m] above it. The points are the feet,
     /// the knees, the calf ends and the lower corners of the trunk.
     pub fn standing_on(ground: &Ground, robot: &RobotModel, q: PerJoint, clearance: f32) -> Self {
-        let rotation = Quat::from_rotation_arc(Vec3::Z, ground.up());
-        let poses = body_poses(robot, Pose { position: Vec3::ZERO, rotation }, &q);
+        Self::standing_at(ground, robot, q, clearance, [0.0; 3])
+    }
+
+    /// Returns the state as [`InitialState::standing_on`] does, above another point of the ground: x [m], y [m], and the yaw
+    /// of the robot [rad].
+    pub fn standing_at(
+        ground: &Ground,
+        robot: &RobotModel,
+        q: PerJoint,
+        clearance: f32,
+        [x, y, yaw]: [f32; 3],
+    ) -> Self {
+        let rotation = Quat::from_rotation_arc(Vec3::Z, ground.up()) * Quat::from_rotation_z(yaw);
+        let poses = body_poses(robot, Pose { position: Vec3::new(x, y, 0.0), rotation }, &q);
         let shapes = &robot.shapes;
         let half = shapes.trunk_half_size.as_vec3();
         let corners = [(1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)].map(|(x, y)| half * Vec3::new(x, y, -1.0));
@@ -59,7 +71,8 @@ impl InitialState {
             .chain(legs)
             .map(|(point, radius)| ground.clearance_height(point.x, point.y, radius) - point.z)
             .fold(f32::NEG_INFINITY, f32::max);
-        Self { base_orientation: frames::to_wxyz(rotation), ..Self::at_rest(lift + clearance, q) }
+        let base_position = [x, y, lift + clearance];
+        Self { base_position, base_orientation: frames::to_wxyz(rotation), ..Self::at_rest(0.0, q) }
     }
 }
 

@@ -56,7 +56,7 @@ pub use body::RigidBody;
 pub use command::Command;
 pub use feet::{Feet, Foot, FootMotion};
 pub use go2::go2;
-pub use ground::Ground;
+pub use ground::{Ground, Patches};
 pub use height_field::{HeightField, HeightFieldError};
 pub use initial_state::InitialState;
 pub use joint::{JOINT_NAMES, Joint, JointKind, Leg, NUM_JOINTS, NUM_LEGS, PerJoint, PerLeg, UnknownJoint};

@@ -30,6 +30,11 @@ pub trait VecEnv: Send {
         &[]
     }
 
+    /// Returns the mean level of the robots on a course of patches; the first is 0. `None` without such a course.
+    fn mean_level(&self) -> Option<f64> {
+        None
+    }
+
     /// Replaces the velocity commands of the task: forward [m/s], left [m/s], yaw rate [rad/s], one per environment.
     ///
     /// They are in force from the next step on, also in later episodes, until they are set again. A step that is rejected

@@ -18,6 +18,11 @@ pub trait Collector: Send {
     /// Starts an episode of each environment, with one seed per environment.
     fn reset(&mut self, seeds: &[u64]) -> Result<(), EnvError>;
 
+    /// Returns the mean level of the robots on a course. `None` without one, and for robots of a server.
+    fn mean_level(&self) -> Option<f64> {
+        None
+    }
+
     /// Sends the request for a trajectory without waiting, so that several collectors work at the same time.
     ///
     /// [`Collector::collect`] with the same arguments follows. Does nothing in this process.
@@ -53,6 +58,10 @@ impl Collector for StepCollector {
 
     fn autoreset(&self) -> AutoresetMode {
         self.0.autoreset()
+    }
+
+    fn mean_level(&self) -> Option<f64> {
+        self.0.mean_level()
     }
 
     fn reset(&mut self, seeds: &[u64]) -> Result<(), EnvError> {

@@ -72,6 +72,9 @@ pub struct CurvePoint {
     pub yaw_rate_rms: Option<f64>,
     /// Falls per robot and minute of simulated time [1/min].
     pub falls_per_minute: f64,
+    /// Mean level of the robots on a course of patches; the first is 0. `None` without a course.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mean_level: Option<f64>,
 }
 
 impl Policy {

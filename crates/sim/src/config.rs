@@ -3,6 +3,8 @@
 use serde::{Deserialize, Serialize};
 use twinstep_model::{BaseMount, Ground, HeightField};
 
+use crate::course::CourseTerrain;
+
 /// Maximum number of cells along a side of a height field: 4 MB.
 const MAX_CELLS: f32 = 1024.0;
 
@@ -81,6 +83,8 @@ pub enum Terrain {
     Rough(RoughTerrain),
     /// A height field of level treads around the origin, with steps between them.
     Steps(StepTerrain),
+    /// Patches of several kinds at several levels, through which robots advance.
+    Course(CourseTerrain),
 }
 
 /// Rough terrain: heights at the corners of square cells, sampled uniformly from 0 to `height_m`.
@@ -159,7 +163,7 @@ impl StepTerrain {
 }
 
 /// Checks that `value` is within the range `[low, high]`.
-fn in_range(
+pub(crate) fn in_range(
     field: &'static str,
     value: f32,
     [low, high]: [f32; 2],
@@ -183,6 +187,7 @@ impl Terrain {
                 Ground { height_field: Some(field.expect("the config was checked").into()), ..Ground::FLAT }
             }
             Terrain::Steps(steps) => Ground { height_field: Some(steps.field().into()), ..Ground::FLAT },
+            Terrain::Course(course) => course.ground(),
         }
     }
 }
@@ -242,6 +247,7 @@ impl SimConfig {
             }
             Terrain::Rough(rough) => rough.check(),
             Terrain::Steps(steps) => steps.check(),
+            Terrain::Course(course) => course.check(),
             Terrain::Flat | Terrain::SlopeRad(_) => Ok(()),
         }
     }

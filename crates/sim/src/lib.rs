@@ -15,6 +15,7 @@ mod actuator_input;
 mod batch;
 mod checks;
 mod config;
+mod course;
 mod error;
 mod ground_shapes;
 mod mujoco;
@@ -30,6 +31,7 @@ mod tree_simulation;
 
 pub use batch::{BatchBackend, BatchSnapshot, SimdPrecision};
 pub use config::{Engine, RoughTerrain, SimConfig, SimConfigError, StepTerrain, Terrain};
+pub use course::{CourseTerrain, PatchKind};
 pub use error::BackendBuildError;
 pub use mujoco::{MujocoBackend, MujocoPlant, effect_outside_mujoco};
 pub use placement::Placement;

@@ -1,6 +1,7 @@
 //! The tasks, one file each, and the `[task]` table of a config file.
 
 use serde::{Deserialize, Serialize};
+use twinstep_model::EnvSpec;
 
 use crate::config::{ConfigError, over_defaults};
 
@@ -112,6 +113,16 @@ impl TaskConfig {
         }
     }
 
+    /// Returns the task of a policy with default settings, and with as many frames as it observes. Returns `None` if there is no
+    /// such task.
+    pub fn of_policy(spec: &EnvSpec) -> Option<Self> {
+        let frames = spec.observation.iter().filter(|field| field.name.starts_with("base_angular_velocity")).count();
+        match Self::named(&spec.task)? {
+            Self::Walk(config) => Some(Self::Walk(WalkConfig { frames: frames.max(1), ..config })),
+            task => Some(task),
+        }
+    }
+
     /// Returns the task with default settings, except for the base policy of `explore` and its largest correction.
     pub fn with_default_settings(&self) -> Self {
         match self {
@@ -119,6 +130,8 @@ impl TaskConfig {
                 let (base, max_residual) = (config.base.clone(), config.max_residual);
                 Self::Explore(ExploreConfig { base, max_residual, ..ExploreConfig::default() })
             }
+            // The frames are part of what a policy observes.
+            Self::Walk(config) => Self::Walk(WalkConfig { frames: config.frames, ..WalkConfig::default() }),
             _ => Self::named(self.name()).expect("a task has its name"),
         }
     }

@@ -1,5 +1,6 @@
 //! The task `walk`: the robot follows a velocity command.
 
+use glam::Vec3;
 use rand::RngExt;
 use twinstep_model::{EnvSpec, RobotModel, Stream, frames};
 
@@ -7,7 +8,8 @@ use crate::ControlledRobot;
 use crate::config::ConfigError;
 use crate::feet::{FootContacts, FootState, foot_states};
 use crate::observation::{
-    base_height, linear_velocity_in_base, observe, observe_privileged, policy_fields, privileged_fields_of, spec_of,
+    base_height, framed, ground_heights_field, linear_velocity_in_base, observe, observe_ground, observe_privileged,
+    policy_fields, privileged_fields_of, privileged_len, spec_of,
 };
 use crate::reward::{NEED_GROUND_TRUTH, RewardInput};
 use crate::task::{RobotView, Step, Task};
@@ -15,6 +17,9 @@ use crate::tasks::walk_config::{RewardWeights, WalkConfig};
 
 /// Fraction of a joint's range within its soft limits.
 const SOFT_JOINT_LIMIT_FACTOR: f32 = 0.9;
+
+/// Yaw rate per error of the heading [1/s] (legged_gym: `heading_command`).
+const HEADING_GAIN: f32 = 0.5;
 
 /// The task `walk` on one robot model.
 #[derive(Clone, Debug)]
@@ -40,6 +45,8 @@ pub struct Walk {
 pub struct WalkState {
     /// Velocity command: forward [m/s], left [m/s], yaw rate [rad/s].
     command: [f32; 3],
+    /// Direction in the world to which the yaw rate turns the robot [rad].
+    heading: Option<f32>,
     /// Policy steps until the next command; `None` if the agent sets it.
     steps_to_command: Option<u32>,
     contacts: FootContacts,
@@ -59,10 +66,12 @@ impl Walk {
         let terms: Vec<usize> =
             (0..RewardWeights::NAMES.len()).filter(|term| known(RewardWeights::NAMES[*term])).collect();
         let names = terms.iter().map(|term| RewardWeights::NAMES[*term].to_owned()).collect();
-        let mut spec = spec_of("walk", &robot, policy_fields(robot.joints.len()), names, config.max_episode_s);
+        let observation = framed(&policy_fields(robot.joints.len()), config.frames);
+        let mut spec = spec_of("walk", &robot, observation, names, config.max_episode_s);
         if has_ground_truth {
             let feet: Vec<_> = robot.feet.feet().iter().map(|foot| foot.name.as_str()).collect();
             spec.critic_observation = privileged_fields_of(&feet);
+            spec.critic_observation.extend(config.critic_heights.then(ground_heights_field));
         }
         let [target_base_height, min_base_height] = config.heights(&robot)?;
         Ok(Self {
@@ -96,6 +105,26 @@ impl Walk {
         let factor = if is_standing { 0.0 } else { 1.0 };
         [ranges.linear_velocity_x, ranges.linear_velocity_y, ranges.angular_velocity_z]
             .map(|[low, high]| factor * (low + (high - low) * random.random::<f32>()))
+    }
+
+    /// Samples a heading for a new command; `None` if its yaw rate is to stay as it is.
+    fn draw_heading(&self, command: [f32; 3], random: &mut Stream) -> Option<f32> {
+        let probability = self.config.heading_probability;
+        // Without headings no random numbers are drawn, and a robot that is to stand does not turn.
+        if probability == 0.0 || command == [0.0; 3] {
+            return None;
+        }
+        let (drawn, heading) = (random.random::<f32>(), std::f32::consts::PI * random.random_range(-1.0f32..1.0));
+        (drawn < probability).then_some(heading)
+    }
+
+    /// Turns the robot to its heading by the yaw rate of its command.
+    fn follow_heading(&self, state: &mut WalkState, robot: &RobotView) {
+        let Some(heading) = state.heading else { return };
+        let forward = frames::world_from_base(robot.orientation) * Vec3::X;
+        let error = heading - forward.y.atan2(forward.x);
+        let [low, high] = self.config.command.angular_velocity_z;
+        state.command[2] = (HEADING_GAIN * error.sin().atan2(error.cos())).clamp(low, high);
     }
 
     fn reward_input<'a>(
@@ -168,7 +197,12 @@ impl Task for Walk {
         let command = self.draw_command(random);
         // The first command is shorter, so that robots that start together do not change their commands together.
         let steps_to_command = Some(random.random_range(1..=self.resample_steps));
-        (q, WalkState { command, steps_to_command, contacts: FootContacts::default() })
+        let heading = self.draw_heading(command, random);
+        (q, WalkState { command, heading, steps_to_command, contacts: FootContacts::default() })
+    }
+
+    fn frames(&self) -> usize {
+        self.config.frames
     }
 
     fn observe(&self, state: &WalkState, robot: &RobotView, action: &[f32], obs: &mut [f32]) {
@@ -177,7 +211,11 @@ impl Task for Walk {
 
     fn observe_critic(&self, _state: &WalkState, robot: &RobotView, obs: &mut [f32]) {
         if let Some(truth) = &robot.truth {
-            observe_privileged(robot, truth, obs);
+            let (own, heights) = obs.split_at_mut(privileged_len(self.robot.feet.len()));
+            observe_privileged(robot, truth, own);
+            if self.config.critic_heights {
+                observe_ground(robot, truth, heights);
+            }
         }
     }
 
@@ -197,7 +235,9 @@ impl Task for Walk {
         state.steps_to_command = state.steps_to_command.map(|steps| steps.saturating_sub(1));
         if state.steps_to_command == Some(0) {
             (state.command, state.steps_to_command) = (self.draw_command(random), Some(self.resample_steps));
+            state.heading = self.draw_heading(state.command, random);
         }
+        self.follow_heading(state, robot);
         is_terminated
     }
 
@@ -206,7 +246,7 @@ impl Task for Walk {
     }
 
     fn set_velocity_command(&self, state: &mut WalkState, command: [f32; 3]) {
-        (state.command, state.steps_to_command) = (command, None);
+        (state.command, state.heading, state.steps_to_command) = (command, None, None);
     }
 }
 
@@ -253,5 +293,71 @@ mod tests {
         };
         assert!(ends(&simulated, true, &mut random), "the base is on the ground");
         assert!(!ends(&real, false, &mut random), "the height of the base is not measured");
+    }
+
+    /// Returns a robot that is turned by `yaw` [rad].
+    fn view<'a>(states: &'a RobotStates, ground: &'a Ground, yaw: f32) -> RobotView<'a> {
+        let robot = RobotView::of(&states.measured, Some(&states.truth), ground, 0);
+        RobotView { orientation: [(0.5 * yaw).cos(), 0.0, 0.0, (0.5 * yaw).sin()], ..robot }
+    }
+
+    #[test]
+    fn frames_of_the_observation_are_those_of_the_last_steps() {
+        let config = WalkConfig { frames: 3, ..WalkConfig::default() };
+        let task = Walk::new(config, &go2(), true).expect("valid");
+        let names: Vec<&str> = task.spec().observation.iter().map(|field| field.name.as_str()).collect();
+        assert_eq!(
+            [names[0], names[6], names[12]],
+            ["base_angular_velocity", "base_angular_velocity_1", "base_angular_velocity_2"]
+        );
+        let (states, ground) = (RobotStates::new(1), Ground::FLAT);
+        let (mut obs, state) = (vec![0.0; task.spec().obs_len()], WalkState::default());
+        for step in 1..=4 {
+            let action = [step as f32; 12];
+            crate::observe_next(&task, &state, &view(&states, &ground, 0.0), &action, &mut obs);
+            if step == 1 {
+                crate::repeat_first_frame(&task, &mut obs);
+                assert_eq!([obs[33], obs[45 + 33], obs[90 + 33]], [1.0; 3], "an episode has no earlier frames");
+            }
+        }
+        assert_eq!([obs[33], obs[45 + 33], obs[90 + 33]], [4.0, 3.0, 2.0]);
+    }
+
+    #[test]
+    fn robot_with_a_heading_turns_to_it_and_an_agent_turns_it_as_it_likes() {
+        let config = WalkConfig { heading_probability: 1.0, ..WalkConfig::default() };
+        let (task, states, ground) =
+            (Walk::new(config, &go2(), true).expect("valid"), RobotStates::new(1), Ground::FLAT);
+        let mut state = WalkState { heading: Some(1.0), ..WalkState::default() };
+        let mut yaw_rate = |state: &mut WalkState, yaw: f32| {
+            task.follow_heading(state, &view(&states, &ground, yaw));
+            state.command[2]
+        };
+        assert!((yaw_rate(&mut state, 0.0) - 0.5).abs() < 1e-5);
+        assert!((yaw_rate(&mut state, 1.2) + 0.1).abs() < 1e-5);
+        state.heading = Some(3.0);
+        assert!(yaw_rate(&mut state, -3.0) < 0.0, "the shorter way");
+        task.set_velocity_command(&mut state, [0.1, 0.0, 0.7]);
+        assert_eq!(yaw_rate(&mut state, 0.0), 0.7);
+    }
+
+    #[test]
+    fn critic_sees_the_depth_of_the_ground_around_the_robot() {
+        let config = WalkConfig { critic_heights: true, ..WalkConfig::default() };
+        let task = Walk::new(config, &go2(), true).expect("valid");
+        let slope = 0.2f32;
+        let ground = Ground { normal: [-slope.sin(), 0.0, slope.cos()], ..Ground::FLAT };
+        let mut states = RobotStates::new(1);
+        states.truth.base_position[0] = [0.0, 0.0, 0.3];
+        let mut obs = vec![0.0; task.spec().critic_obs_len()];
+        for (yaw, ahead) in [(0.0, slope.tan()), (std::f32::consts::FRAC_PI_2, 0.0)] {
+            task.observe_critic(&WalkState::default(), &view(&states, &ground, yaw), &mut obs);
+            let depths = &obs[11..];
+            assert_eq!(depths.len(), 35);
+            assert!((depths[17] - 0.3).abs() < 1e-5, "under the base");
+            assert!((depths[32] - (0.3 - 0.6 * ahead)).abs() < 1e-5, "0.6 m ahead: {}", depths[32]);
+            let left = 0.3 + if yaw == 0.0 { 0.0 } else { 0.4 * slope.tan() };
+            assert!((depths[19] - left).abs() < 1e-5, "0.4 m to the left: {}", depths[19]);
+        }
     }
 }

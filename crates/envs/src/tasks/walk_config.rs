@@ -12,6 +12,9 @@ const GO2_BASE_HEIGHT: f64 = 0.30;
 /// Height of the base below which a Go2 has fallen [m].
 const GO2_MIN_HEIGHT: f64 = 0.15;
 
+/// Largest number of frames of an observation.
+const MOST_FRAMES: usize = 20;
+
 /// The `[task]` table of `walk`: velocity commands, rewards, termination.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -22,6 +25,9 @@ pub struct WalkConfig {
     pub command_resample_s: f32,
     /// Probability that a new velocity command is zero: the robot stands.
     pub standing_probability: f32,
+    /// Probability that a new velocity command has a heading: its yaw rate turns the robot to it, so that the robot goes
+    /// straight on. Default: 0, the yaw rate is sampled.
+    pub heading_probability: f32,
     /// Ranges of the velocity commands.
     pub command: CommandRanges,
     /// Weight of each reward term; 0 disables the term.
@@ -43,6 +49,10 @@ pub struct WalkConfig {
     pub min_base_height_m: Option<f32>,
     /// Maximum initial offset of each joint from the default pose [rad].
     pub reset_joint_noise_rad: f32,
+    /// Frames of the observation: the present one, and those of the policy steps before. Default: 1.
+    pub frames: usize,
+    /// True if a critic observes the heights of the ground around the robot.
+    pub critic_heights: bool,
 }
 
 impl Default for WalkConfig {
@@ -51,6 +61,7 @@ impl Default for WalkConfig {
             max_episode_s: 20.0,
             command_resample_s: 5.0,
             standing_probability: 0.05,
+            heading_probability: 0.0,
             command: CommandRanges::default(),
             reward: RewardWeights::default(),
             tracking_sigma: 0.25,
@@ -60,6 +71,8 @@ impl Default for WalkConfig {
             max_tilt_rad: 1.0,
             min_base_height_m: None,
             reset_joint_noise_rad: 0.1,
+            frames: 1,
+            critic_heights: false,
         }
     }
 }
@@ -75,6 +88,7 @@ impl WalkConfig {
         check_value("task.command_resample_s", self.command_resample_s, 0.02, 1e6)?;
         check_value("task.tracking_sigma", self.tracking_sigma, 1e-6, 1e6)?;
         check_value("task.standing_probability", self.standing_probability, 0.0, 1.0)?;
+        check_value("task.heading_probability", self.heading_probability, 0.0, 1.0)?;
         if let Some(height) = self.target_base_height_m {
             check_value("task.target_base_height_m", height, 0.0, 10.0)?;
         }
@@ -85,6 +99,10 @@ impl WalkConfig {
             check_value("task.min_base_height_m", height, -1e6, 10.0)?;
         }
         check_value("task.reset_joint_noise_rad", self.reset_joint_noise_rad, 0.0, 1.0)?;
+        if !(1..=MOST_FRAMES).contains(&self.frames) {
+            let allowed = format!("1 to {MOST_FRAMES}");
+            return Err(ConfigError { field: "task.frames".to_owned(), value: self.frames.to_string(), allowed });
+        }
         self.reward
             .values()
             .try_for_each(|(name, weight)| check_value(&format!("task.reward.{name}"), weight, -1e6, 1e6))

@@ -129,19 +129,19 @@ fn contacts_with_field<T: SimdFloat>(
     let ([x, y, z], up) = (centre.0, Vec3::splat(DVec3::Z));
     let (mut heights, mut normals) = ([z; MOST_CONTACTS], [up; MOST_CONTACTS]);
     for lane in 0..T::LANES {
-        let centre = glam::DVec3::new(x.get(lane), y.get(lane), z.get(lane)).as_vec3();
+        let centre = DVec3::new(x.get(lane), y.get(lane), z.get(lane)).as_vec3();
         for (contact, touch) in field.touches(centre, radius.get(lane) as f32).into_iter().enumerate() {
             heights[contact].set(lane, f64::from(touch.distance));
             normals[contact].set(lane, touch.normal.as_dvec3());
         }
     }
-    std::array::from_fn(|contact| {
-        let [normal, along, across] = with_tangents(normals[contact]);
-        TangentPlane {
-            height: heights[contact],
-            directions: [to_base(normal, axes), to_base(along, axes), to_base(across, axes)],
-        }
-    })
+    [tangent_plane(heights[0], normals[0], axes), tangent_plane(heights[1], normals[1], axes)]
+}
+
+#[inline(always)]
+fn tangent_plane<T: SimdFloat>(height: T, normal: Vec3<T>, axes: &[Vec3<T>; 3]) -> TangentPlane<T> {
+    let [normal, along, across] = with_tangents(normal);
+    TangentPlane { height, directions: [to_base(normal, axes), to_base(along, axes), to_base(across, axes)] }
 }
 
 /// Returns an upward normal and two tangents; x and y on level ground (Duff et al. 2017, equation 3).
