@@ -119,12 +119,9 @@ fn walk_over_steps<B: Backend>(backend: B) -> (f32, usize) {
         runner.run(&obs, &mut actions);
         let batch = env.step(&actions).unwrap();
         obs.copy_from_slice(&batch.obs);
-        for robot in 0..robots {
-            has_fallen[robot] |= batch.terminated[robot];
-        }
-        if has_fallen.iter().any(|has_fallen| *has_fallen) {
-            let fallen: Vec<bool> = has_fallen.clone();
-            env.reset(&ResetRequest { seeds: None, mask: Some(fallen) }).unwrap();
+        has_fallen.iter_mut().zip(&batch.terminated).for_each(|(has_fallen, ended)| *has_fallen |= ended);
+        if has_fallen.contains(&true) {
+            env.reset(&ResetRequest { seeds: None, mask: Some(has_fallen.clone()) }).unwrap();
         }
         let truth = env.backend().ground_truth().unwrap();
         velocities

@@ -253,6 +253,46 @@ fn shipped_policy_walks_in_both_engines() {
 }
 
 #[test]
+fn training_on_a_course_names_its_level_and_its_policy_is_judged_on_one() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("terrain");
+    let flags = ["train", "walk", "--terrain", "--envs", "28", "--steps", "3000", "--out", out.to_str().unwrap()];
+    let trained = twinstep(&flags);
+    assert!(trained.status.success(), "{}", text(&trained.stderr));
+    let table = std::fs::read_to_string(out.join("progress.csv")).unwrap();
+    let mut rows = table.lines().map(|row| row.split(',').collect::<Vec<_>>());
+    let column = rows.next().unwrap().iter().position(|name| *name == "mean_level").unwrap();
+    let levels: Vec<f64> = rows.map(|row| row[column].parse().unwrap()).collect();
+    assert!(!levels.is_empty() && levels.iter().all(|level| (0.0..=9.0).contains(level)), "{levels:?}");
+    let policy = out.join("policy.safetensors");
+    assert_eq!(Policy::read(&policy).unwrap().0.spec.obs_len(), 5 * 45);
+    let judged = twinstep(&["evaluate-policy", policy.to_str().unwrap(), "--course", "--robots", "14", "--json"]);
+    assert!(judged.status.success(), "{}", text(&judged.stderr));
+    let report: serde_json::Value = serde_json::from_slice(&judged.stdout).unwrap();
+    let kinds = report["rows"].as_array().unwrap();
+    let robots =
+        kinds.iter().flat_map(|kind| kind["levels"].as_array().unwrap()).map(|level| level["robots"].as_u64().unwrap());
+    assert_eq!((kinds.len(), robots.sum::<u64>()), (7, 14));
+    let jump = root().join("data/policies/jump.safetensors");
+    let refused = twinstep(&["evaluate-policy", jump.to_str().unwrap(), "--course"]);
+    assert!(text(&refused.stderr).contains("`--course` is for policies of `walk`, and this is one of `jump`"));
+}
+
+#[test]
+fn shipped_policy_of_terrain_climbs_slopes_waves_and_steps() {
+    let policy = root().join("data/policies/walk_terrain.safetensors");
+    let judged = twinstep(&["evaluate-policy", policy.to_str().unwrap(), "--course", "--robots", "350", "--json"]);
+    assert!(judged.status.success(), "{}", text(&judged.stderr));
+    let report: serde_json::Value = serde_json::from_slice(&judged.stdout).unwrap();
+    for (kind, least) in
+        [("slope_up", 7), ("slope_down", 7), ("stairs_up", 2), ("stairs_down", 4), ("wave", 8), ("rough", 8)]
+    {
+        let row = report["rows"].as_array().unwrap().iter().find(|row| row["kind"] == kind).unwrap();
+        assert!(row["passed"].as_u64().unwrap() >= least, "{row}");
+    }
+}
+
+#[test]
 fn shipped_policy_follows_a_circle_a_figure_of_eight_and_a_square() {
     let policy = root().join("data/policies/track.safetensors");
     let arguments = ["evaluate-policy", policy.to_str().unwrap(), "--robots", "8", "--seconds", "8", "--json"];

@@ -58,9 +58,12 @@ pub fn course(kinds: &[KindOfGround]) -> String {
             PatchKind::SlopeUp | PatchKind::SlopeDown => size.to_degrees(),
             _ => 100.0 * size,
         };
-        let share = |level: &Level| 100.0 * level.arrived as f64 / level.robots.max(1) as f64;
+        let share = |level: &Level| match level.robots {
+            0 => format!("{:>7}", "-"),
+            robots => format!("{:5.0} %", 100.0 * level.arrived as f64 / robots as f64),
+        };
         let row = |cells: &mut dyn Iterator<Item = String>| cells.collect::<Vec<_>>().join(" ");
-        let shares = row(&mut levels.iter().map(|level| format!("{:5.0} %", share(level))));
+        let shares = row(&mut levels.iter().map(share));
         let sizes = row(&mut levels.iter().map(|level| format!("{:7.1}", unit(level.size))));
         let _ = writeln!(text, "  {shares}\n {sizes}");
     }

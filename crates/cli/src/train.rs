@@ -49,6 +49,7 @@ const SAVE_EVERY: Duration = Duration::from_secs(10);
 /// --steps 1000000`
 #[derive(clap::Args)]
 #[command(verbatim_doc_comment)]
+#[allow(clippy::struct_excessive_bools, reason = "each is a flag of the command")]
 pub struct Args {
     /// Task to learn. Default: that of the config file, else walk.
     #[arg(value_parser = ["walk", "track", "jump", "gait", "attitude", "explore", "pose"])]

@@ -87,7 +87,7 @@ impl Measure for CourseWalking {
     type Found = Vec<KindOfGround>;
 
     fn add(&mut self, step: &mut Step<'_>) -> Result<(), EnvError> {
-        if step.index % LOOK_STEPS != 0 {
+        if !step.index.is_multiple_of(LOOK_STEPS) {
             return Ok(());
         }
         for robot in step.robots() {

@@ -14,8 +14,8 @@ use crate::{
 const GRAVITY: f64 = 9.81;
 /// Thickness of a height field below its lowest point [m].
 const FIELD_BASE: f64 = 0.5;
-/// Distance of the plane around a height field below z = 0 [m].
-const PLANE_BELOW_FIELD: f64 = 0.001;
+/// Width and thickness of the level slabs around a height field [m].
+const SURROUNDINGS: [f64; 2] = [500.0, 1.0];
 
 /// Options of a MuJoCo model.
 #[derive(Clone, Debug, PartialEq)]
@@ -28,7 +28,7 @@ pub struct MjcfOptions {
     pub timestep: f64,
     /// Type of the twelve actuators, which determines the meaning of `ctrl`.
     pub actuator: MjcfActuator,
-    /// The ground. Around a height field it is the plane z = 0, at which the field's edge is expected.
+    /// The ground. Around a height field it is level at z = 0, where the field's edge is expected.
     pub ground: Ground,
 }
 
@@ -138,17 +138,24 @@ fn height_range(field: &HeightField) -> [f64; 2] {
 
 fn ground(xml: &mut Xml, ground: &Ground) {
     let collides = [("contype", "1".to_owned()), ("conaffinity", "0".to_owned())];
-    let mut point = Vec3::from(ground.point).as_dvec3();
+    let point = Vec3::from(ground.point).as_dvec3();
     if let Some(field) = &ground.height_field {
-        let centre = |axis: usize| {
-            let length = f64::from(field.cell_size()) * (field.shape()[axis] - 1) as f64;
-            f64::from(field.origin()[axis]) + 0.5 * length
-        };
+        let half = |axis: usize| 0.5 * f64::from(field.cell_size()) * (field.shape()[axis] - 1) as f64;
+        let centre = |axis: usize| f64::from(field.origin()[axis]) + half(axis);
         let place = numbers([centre(0), centre(1), height_range(field)[0]]);
         let named = [("name", "heights".to_owned()), ("type", "hfield".to_owned()), ("hfield", "heights".to_owned())];
         xml.leaf("geom", &named.into_iter().chain([("pos", place)]).chain(collides.clone()).collect::<Vec<_>>());
-        // So that a foot does not touch both.
-        point.z -= PLANE_BELOW_FIELD;
+        // A plane would fill the pits of the field.
+        let [width, thickness] = SURROUNDINGS.map(|size| 0.5 * size);
+        let beside = [half(0) + width, half(1) + width];
+        for (sign_x, sign_y) in [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)] {
+            let size = if sign_y == 0.0 { [width, half(1)] } else { [half(0) + 2.0 * width, width] };
+            let place = [centre(0) + sign_x * beside[0], centre(1) + sign_y * beside[1], -thickness];
+            let slab =
+                [("type", "box".to_owned()), ("size", numbers([size[0], size[1], thickness])), ("pos", numbers(place))];
+            xml.leaf("geom", &slab.into_iter().chain(collides.clone()).collect::<Vec<_>>());
+        }
+        return;
     }
     let size = ("size", numbers([0.0, 0.0, 0.05]));
     let mut plane = vec![("name", "ground".to_owned()), ("type", "plane".to_owned()), size];
@@ -413,6 +420,10 @@ mod tests {
         assert_eq!(rounded("elevation"), [0.2, 0.4, 0.6, 0.1, 0.3, 0.5]);
         let places: Vec<_> = values(&xml, "geom", "pos")[0].split(' ').collect();
         assert_eq!((places[0], places[1]), ("1.5", "2.25"));
+        assert!(!values(&xml, "geom", "type").contains(&"plane"), "a plane would fill the pits");
+        let slabs = values(&xml, "geom", "type").iter().filter(|kind| **kind == "box").count();
+        let without = model(MjcfOptions::default());
+        assert_eq!(slabs, 4 + values(&without, "geom", "type").iter().filter(|kind| **kind == "box").count());
     }
 
     #[test]

@@ -329,7 +329,7 @@ mod tests {
         let (task, states, ground) =
             (Walk::new(config, &go2(), true).expect("valid"), RobotStates::new(1), Ground::FLAT);
         let mut state = WalkState { heading: Some(1.0), ..WalkState::default() };
-        let mut yaw_rate = |state: &mut WalkState, yaw: f32| {
+        let yaw_rate = |state: &mut WalkState, yaw: f32| {
             task.follow_heading(state, &view(&states, &ground, yaw));
             state.command[2]
         };

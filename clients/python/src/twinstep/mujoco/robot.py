@@ -165,4 +165,6 @@ class Robot:
         address = contact.efc_address
         # With elliptic cones the first row of a contact is its normal force. A contact without rows has no force.
         force = np.where(address >= 0, self._data.efc_force[address], 0.0) if len(address) else np.zeros(0)
-        return np.bincount(contact.geom[:, 1], force, self._model.ngeom).astype(np.float64)
+        # Which of the two is the robot's depends on their types: a box of the ground comes after a sphere.
+        sums = [np.bincount(contact.geom[:, side], force, self._model.ngeom) for side in range(2)]
+        return (sums[0] + sums[1]).astype(np.float64)
