@@ -6,7 +6,9 @@ use twinstep_envs::{Attitude, CounterEnv, GaitTask, Jump, Task, TaskConfig, Task
 use twinstep_model::{Actuator, AutoresetMode, Backend, EnvSpec, RobotModel, VecEnv};
 use twinstep_policy::array_file::ArrayFileError;
 use twinstep_policy::{OtherBase, Policy, ResidualEnv};
-use twinstep_sim::{BackendBuildError, BatchBackend, Engine, MujocoBackend, MujocoPlant, RapierBackend};
+use twinstep_sim::{
+    BackendBuildError, BatchBackend, Engine, MujocoBackend, MujocoPlant, RapierBackend, SimConfigError, Terrain,
+};
 
 use twinstep_protocol::{message, random_u64};
 
@@ -141,6 +143,12 @@ impl SimEnvFactory {
             None => file.robot_model().expect("the model file was checked when it was read"),
         };
         config.sim.check(robot.control.actuator_hz).map_err(BackendBuildError::Config)?;
+        if let (Terrain::Course(_), TaskConfig::Track(_) | TaskConfig::Jump(_)) = (config.sim.terrain, &config.task) {
+            // Their paths and targets are about the origin.
+            let (field, value) = ("terrain", format!("course with the task `{}`", config.task.name()));
+            let allowed = "a course for the tasks `walk`, `gait`, `attitude` and `explore`".to_owned();
+            return Err(BackendBuildError::Config(SimConfigError { field, value, allowed }).into());
+        }
         let seed = config.server.seed.unwrap_or_else(random_u64);
         let robots = if config.randomise.effects { Some(RobotSampler::new(file)?) } else { None };
         let base = match &config.task {

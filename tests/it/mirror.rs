@@ -71,8 +71,9 @@ fn mirrored_actions_give_mirrored_observations_and_the_same_reward() {
 fn mirror_image_of_the_mirror_image_is_the_vector() {
     let env = robot([0.0; 3]);
     let mirror = Mirror::of_observations(env.spec()).unwrap();
-    let vector: Vec<f32> = (0..56).map(|entry| entry as f32 + 1.0).collect();
-    let (mut once, mut twice) = (vec![0.0; 56], vec![0.0; 56]);
+    let entries = env.spec().obs_len() + env.spec().critic_obs_len();
+    let vector: Vec<f32> = (0..entries).map(|entry| entry as f32 + 1.0).collect();
+    let (mut once, mut twice) = (vec![0.0; entries], vec![0.0; entries]);
     mirror.apply(&vector, &mut once);
     mirror.apply(&once, &mut twice);
     assert_eq!(twice, vector);

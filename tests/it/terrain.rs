@@ -137,15 +137,15 @@ fn does_not_fall_through<B: Simulator>(make: Make<B>, min_foot_from_1_m: f32, mi
     }
 }
 
-fn course() -> Terrain {
-    Terrain::Course(CourseTerrain { stairs_m: Some([0.1, 0.2]), levels: 2, seed: 1, ..CourseTerrain::default() })
+fn course(stairs_m: [f32; 2], levels: u32) -> Terrain {
+    Terrain::Course(CourseTerrain { stairs_m: Some(stairs_m), levels, seed: 1, ..CourseTerrain::default() })
 }
 
 /// Robots of a policy that does not know stairs run against them; no foot may get into a face.
 #[test]
 fn foot_that_is_driven_against_stairs_stays_outside_of_them() {
     let (policy, _) = Policy::read(root().join("data/policies/walk_robust.safetensors")).unwrap();
-    let sim = SimConfig { terrain: course(), threads: 1, ..SimConfig::default() };
+    let sim = SimConfig { terrain: course([0.2; 2], 1), threads: 1, ..SimConfig::default() };
     let walk = Walk::new(WalkConfig { min_base_height_m: Some(-10.0), ..WalkConfig::default() }, &go2(), true).unwrap();
     let settings = TaskEnvConfig {
         randomise: Randomisation::default(),
@@ -159,19 +159,21 @@ fn foot_that_is_driven_against_stairs_stays_outside_of_them() {
     let mut obs = env.reset(&ResetRequest::seeded(1, 8)).unwrap().to_vec();
     let (mut runner, mut actions) = (PolicyRunner::new(&policy), vec![0.0; 8 * 12]);
     let ground = env.backend().ground();
-    let mut lowest = f32::INFINITY;
+    let (mut lowest, mut farthest, patches) = (f32::INFINITY, 0.0f32, ground.patches.unwrap());
     for _ in 0..400 {
         runner.run(&obs, &mut actions);
         obs.copy_from_slice(&env.step(&actions).unwrap().obs);
         for robot in 0..8 {
             let scene = env.scene(robot).unwrap();
+            let ([x, y, ..], [middle_x, middle_y]) = (scene.pose[0], patches.centre(0, robot % 2));
+            farthest = farthest.max((x - middle_x).abs().max((y - middle_y).abs()));
             for [x, y, z] in foot_centres_of(&scene) {
                 lowest = lowest.min(z - ground.height(x, y));
             }
         }
     }
     assert!(lowest > 0.0, "the centre of a foot was {lowest} m from above the ground");
-    assert!(lowest < 0.03, "no foot has touched the ground");
+    assert!(farthest > 0.8, "no robot has reached a step: {farthest} m");
 }
 
 /// Returns the centres of the feet in a scene [m].
@@ -187,12 +189,30 @@ fn foot_centres_of(scene: &Scene) -> Vec<[f32; 3]> {
 }
 
 #[test]
+fn settings_of_a_walk_on_a_course_are_refused_for_tasks_that_do_not_have_them() {
+    let of_factory = |text: &str| {
+        let config = Config::parse(text, "server.toml").unwrap();
+        SimEnvFactory::new(config).err().map(|error| error.to_string()).unwrap_or_default()
+    };
+    let sim = "[sim]\nterrain = { course = { stairs_m = [0.1, 0.1], seed = 1 } }\n[task]\n";
+    assert!(of_factory(&format!("{sim}name = \"jump\"")).contains("`sim.terrain` = course with the task `jump`"));
+    assert_eq!(of_factory(&format!("{sim}name = \"gait\"")), "");
+    for task in ["gait", "jump", "track", "attitude"] {
+        let text = format!("[task]\nname = \"{task}\"\nwalk = {{ frames = 2 }}");
+        let error = Config::parse(&text, "server.toml").unwrap_err().to_string();
+        assert!(error.contains("frames` = 2 is not allowed: 1; others are for the task `walk`"), "{task}: {error}");
+    }
+}
+
+#[test]
 fn robots_start_on_the_patches_of_a_course_and_stand_there() {
-    let config =
-        Config { sim: SimConfig { terrain: course(), ..SimConfig::default() }, ..config(TaskConfig::default()) };
+    let config = Config {
+        sim: SimConfig { terrain: course([0.1, 0.2], 2), ..SimConfig::default() },
+        ..config(TaskConfig::default())
+    };
     let mut env = SimEnvFactory::new(config).unwrap().build(6, AutoresetMode::NextStep, None).unwrap();
     env.reset(&ResetRequest::seeded(1, 6)).unwrap();
-    let (ground, level) = (course().ground(), env.mean_level().unwrap());
+    let (ground, level) = (course([0.1, 0.2], 2).ground(), env.mean_level().unwrap());
     assert!((0.0..=1.0).contains(&level), "{level}");
     for _ in 0..50 {
         assert!(!env.step(&[0.0; 72]).unwrap().terminated.contains(&true), "a standing robot does not fall");

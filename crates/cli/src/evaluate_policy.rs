@@ -46,7 +46,8 @@ const FILM_STEPS: usize = 4;
 ///
 /// --course shows how steep and high a ground a policy of `walk` masters instead: slopes, stairs,
 /// obstacles, waves and rough ground at ten levels each. Every robot starts in the middle of a
-/// patch of 8 m and walks straight on at 0.8 m/s; the table has the share that arrive at its end.
+/// patch of 8 m and walks on at 0.8 m/s, while it turns to a random heading; the table has the share
+/// that arrive at its border. Gains and action scale are those of the policy, without --model.
 ///
 /// Without --engine the nominal robot is also simulated in rapier, which no policy is trained in.
 /// `--engine mujoco` needs `pip install "twinstep[mujoco]"` and simulates a thousand env-steps per
@@ -81,7 +82,7 @@ pub struct Args {
     #[arg(long, value_name = "FILE")]
     film: Option<PathBuf>,
     /// Walk over slopes, stairs, obstacles, waves and rough ground instead.
-    #[arg(long, conflicts_with_all = ["condition", "seconds"])]
+    #[arg(long, conflicts_with_all = ["condition", "seconds", "film"])]
     course: bool,
     /// Print one JSON object on stdout.
     #[arg(long)]

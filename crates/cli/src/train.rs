@@ -233,6 +233,11 @@ impl Args {
             None => TrainConfig::default(),
         };
         if let Some(task) = self.task.as_deref().filter(|task| *task != config.task.name()) {
+            if self.terrain {
+                return Err(Failure::Input(miette::miette!(
+                    "`--terrain` is for the task `walk`, and `{task}` is named"
+                )));
+            }
             if config.task != TaskConfig::default() {
                 let of_config = config.task.name();
                 return Err(Failure::Input(miette::miette!(

@@ -1,13 +1,14 @@
-//! Levels of the robots on a course: who walks far goes on to more difficult ground, who does not goes back.
+//! Levels of the robots on a course: a robot that walks far goes on to more difficult ground, another one goes back.
 //!
 //! The rule is that of Rudin et al. 2021, section 3.2: up after half the side of a patch, down if the robot has walked less than
-//! half of what was commanded. Who leaves the last level goes on at a random one.
+//! half of what was commanded. A robot that leaves the last level goes on at a random one. Unlike there, what was commanded is
+//! that until the episode ended, so a robot that falls after it has followed its command stays at its level.
 
 use rand::RngExt;
 use twinstep_model::{Patches, Stream};
 
 /// Share of the commanded distance below which a robot goes back a level.
-const ENOUGH: f32 = 0.5;
+const MIN_WALKED_SHARE: f32 = 0.5;
 
 /// The robots of a batch on the patches of a course.
 #[derive(Clone, Debug)]
@@ -45,7 +46,7 @@ impl Course {
                 let walked = (x - walker.start[0]).hypot(y - walker.start[1]);
                 if walked > 0.5 * patches.side {
                     if walker.level + 1 < patches.levels { walker.level + 1 } else { any_level }
-                } else if walked < ENOUGH * walker.commanded {
+                } else if walked < MIN_WALKED_SHARE * walker.commanded {
                     walker.level.saturating_sub(1)
                 } else {
                     walker.level

@@ -10,7 +10,7 @@ use crate::{Measure, Step};
 
 /// Forward velocity that is commanded [m/s].
 const SPEED: f32 = 0.8;
-/// Distance from the start at which a robot has arrived [m]: every step and slope of a patch is behind it.
+/// Distance from the start along either axis at which a robot has arrived [m]: every step and slope of its patch is behind it.
 const ARRIVED: f32 = 3.8;
 /// Policy steps between two looks at the position.
 const LOOK_STEPS: usize = 25;
@@ -58,7 +58,7 @@ impl CourseWalking {
         Self { terrain, patches, starts: vec![None; robots], arrived: vec![false; robots] }
     }
 
-    /// Returns the settings of the task for a policy with these: straight on, in any direction.
+    /// Returns the settings of the task for a policy with these: forward, while the robot turns to a random heading.
     pub fn task(trained: &WalkConfig) -> WalkConfig {
         let command = CommandRanges {
             linear_velocity_x: [SPEED; 2],
@@ -100,7 +100,7 @@ impl Measure for CourseWalking {
                     let (level, column) = self.patch([x, y]);
                     self.starts[robot] = Some((level, column, [x, y]));
                 }
-                Some((_, _, start)) => self.arrived[robot] = (x - start[0]).hypot(y - start[1]) > ARRIVED,
+                Some((_, _, start)) => self.arrived[robot] = (x - start[0]).abs().max((y - start[1]).abs()) > ARRIVED,
             }
         }
         Ok(())

@@ -60,6 +60,10 @@ impl VecEnv for ResidualEnv {
         self.env.num_envs()
     }
 
+    fn mean_level(&self) -> Option<f64> {
+        self.env.mean_level()
+    }
+
     fn autoreset(&self) -> twinstep_model::AutoresetMode {
         self.env.autoreset()
     }

@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 use twinstep_model::{BaseMount, Ground, HeightField};
 
+use crate::config_error::{SimConfigError, in_range};
 use crate::course::CourseTerrain;
 
 /// Maximum number of cells along a side of a height field: 4 MB.
@@ -162,19 +163,6 @@ impl StepTerrain {
     }
 }
 
-/// Checks that `value` is within the range `[low, high]`.
-pub(crate) fn in_range(
-    field: &'static str,
-    value: f32,
-    [low, high]: [f32; 2],
-    allowed: impl Fn() -> String,
-) -> Result<(), SimConfigError> {
-    if (low..=high).contains(&value) {
-        return Ok(());
-    }
-    Err(SimConfigError { field, value: value.to_string(), allowed: allowed() })
-}
-
 impl Terrain {
     /// Builds the ground. A height field is sampled in each call, so build it once and share it.
     pub fn ground(self) -> Ground {
@@ -190,18 +178,6 @@ impl Terrain {
             Terrain::Course(course) => course.ground(),
         }
     }
-}
-
-/// A setting is outside its range.
-#[derive(Clone, Debug, PartialEq, thiserror::Error)]
-#[error("`sim.{field}` = {value} is not allowed: {allowed}")]
-pub struct SimConfigError {
-    /// The key.
-    pub field: &'static str,
-    /// Its value.
-    pub value: String,
-    /// The allowed values.
-    pub allowed: String,
 }
 
 impl SimConfig {

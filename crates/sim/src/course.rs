@@ -1,15 +1,14 @@
 //! A course: patches of ground of several kinds, each at several levels of difficulty, on one height field.
 //!
 //! Patches are squares in a grid: a row is a level, a column a kind. The middle of a patch is a level platform, on which a
-//! robot starts; its border is at height 0, where it meets its neighbours. Slopes and stairs are pyramids, so that they are
-//! the same in every direction: `up` starts in a pit, `down` on a top (Rudin et al. 2021, section 3.2).
+//! robot starts; its border is at height 0, where it meets its neighbours. Slopes and stairs are square
+//! pyramids, alike on all four sides: `up` starts in a pit, `down` on a top (Rudin et al. 2021, section 3.2).
 
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
 use twinstep_model::{Ground, HeightField, Patches, stream};
 
-use crate::SimConfigError;
-use crate::config::in_range;
+use crate::config_error::{SimConfigError, in_range};
 
 /// Side length of a patch [m].
 const PATCH_M: f32 = 8.0;

@@ -15,6 +15,7 @@ mod actuator_input;
 mod batch;
 mod checks;
 mod config;
+mod config_error;
 mod course;
 mod error;
 mod ground_shapes;
@@ -30,7 +31,8 @@ mod tree_error;
 mod tree_simulation;
 
 pub use batch::{BatchBackend, BatchSnapshot, SimdPrecision};
-pub use config::{Engine, RoughTerrain, SimConfig, SimConfigError, StepTerrain, Terrain};
+pub use config::{Engine, RoughTerrain, SimConfig, StepTerrain, Terrain};
+pub use config_error::SimConfigError;
 pub use course::{CourseTerrain, PatchKind};
 pub use error::BackendBuildError;
 pub use mujoco::{MujocoBackend, MujocoPlant, effect_outside_mujoco};

@@ -74,6 +74,10 @@ impl VecEnv for WatchedVecEnv {
         self.env.autoreset()
     }
 
+    fn mean_level(&self) -> Option<f64> {
+        self.env.mean_level()
+    }
+
     fn reset(&mut self, request: &ResetRequest) -> Result<&[f32], EnvError> {
         self.env.reset(request)
     }

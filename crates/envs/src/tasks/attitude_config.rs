@@ -56,6 +56,6 @@ impl AttitudeConfig {
         check_value("task.track_height", self.track_height, -1e6, 1e6)?;
         check_value("task.attitude_sigma", self.attitude_sigma, 1e-6, 1e6)?;
         check_value("task.height_sigma", self.height_sigma, 1e-6, 1e6)?;
-        self.walk.check().map_err(|error| error.within("walk"))
+        self.walk.check_as_part().map_err(|error| error.within("walk"))
     }
 }

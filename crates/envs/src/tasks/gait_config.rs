@@ -80,7 +80,7 @@ impl GaitConfig {
         self.reward
             .values()
             .try_for_each(|(name, weight)| check_value(&format!("task.reward.{name}"), weight, -1e6, 1e6))?;
-        self.walk.check().map_err(|error| error.within("walk"))
+        self.walk.check_as_part().map_err(|error| error.within("walk"))
     }
 
     /// Returns the contact schedule of a foot.

@@ -71,6 +71,6 @@ impl TrackConfig {
         check_value("task.position_sigma", self.position_sigma, 1e-6, 1e6)?;
         check_value("task.heading_sigma", self.heading_sigma, 1e-6, 1e6)?;
         check_value("task.max_position_error_m", self.max_position_error_m, 0.01, 1e6)?;
-        self.walk.check().map_err(|error| error.within("walk"))
+        self.walk.check_as_part().map_err(|error| error.within("walk"))
     }
 }

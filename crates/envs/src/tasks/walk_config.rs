@@ -13,7 +13,7 @@ const GO2_BASE_HEIGHT: f64 = 0.30;
 const GO2_MIN_HEIGHT: f64 = 0.15;
 
 /// Largest number of frames of an observation.
-const MOST_FRAMES: usize = 20;
+const MAX_FRAMES: usize = 20;
 
 /// The `[task]` table of `walk`: velocity commands, rewards, termination.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -99,13 +99,32 @@ impl WalkConfig {
             check_value("task.min_base_height_m", height, -1e6, 10.0)?;
         }
         check_value("task.reset_joint_noise_rad", self.reset_joint_noise_rad, 0.0, 1.0)?;
-        if !(1..=MOST_FRAMES).contains(&self.frames) {
-            let allowed = format!("1 to {MOST_FRAMES}");
+        if !(1..=MAX_FRAMES).contains(&self.frames) {
+            let allowed = format!("1 to {MAX_FRAMES}");
             return Err(ConfigError { field: "task.frames".to_owned(), value: self.frames.to_string(), allowed });
         }
         self.reward
             .values()
             .try_for_each(|(name, weight)| check_value(&format!("task.reward.{name}"), weight, -1e6, 1e6))
+    }
+
+    /// Checks the settings as a part of those of another task, which adds its own entries to a single frame.
+    pub(crate) fn check_as_part(&self) -> Result<(), ConfigError> {
+        let refused = |key: &str, value: String, allowed: &str| {
+            Err(ConfigError {
+                field: format!("task.{key}"),
+                value,
+                allowed: format!("{allowed}; others are for the task `walk`"),
+            })
+        };
+        match self {
+            Self { frames, .. } if *frames != 1 => refused("frames", frames.to_string(), "1"),
+            Self { critic_heights: true, .. } => refused("critic_heights", "true".to_owned(), "false"),
+            Self { heading_probability, .. } if *heading_probability != 0.0 => {
+                refused("heading_probability", heading_probability.to_string(), "0")
+            }
+            _ => self.check(),
+        }
     }
 
     /// Returns the heights of the base without a penalty, and below which the episode terminates [m].

@@ -10,7 +10,9 @@ use glam::Vec3;
 use twinstep_model::HeightField;
 
 /// Largest cosine between the normals of two faces that a sphere touches at once.
-const DIFFERENT: f32 = 0.95;
+const MAX_COSINE: f32 = 0.95;
+/// Distance below which the direction to the surface is not known, and its own normal counts [m].
+const AT_SURFACE: f32 = 1e-4;
 /// Depth of a centre below the surface up to which the nearest point of the surface is the way out [m].
 const DEPTH: f32 = 0.03;
 /// Width of the blocks that hold the extreme heights near a point, and near a body [m].
@@ -83,7 +85,7 @@ impl ContactField {
             let (point, _) = nearest_point(corners);
             let distance = point.length();
             if distance < nearest.distance {
-                let away = if distance > 1e-6 { -point / distance } else { upward_normal(corners) };
+                let away = if distance > AT_SURFACE { -point / distance } else { upward_normal(corners) };
                 nearest = Touch { distance, normal: away };
             }
         });
@@ -91,7 +93,8 @@ impl ContactField {
             // Deeper than this, the way out is up.
             let vertical = Touch { distance: above * normal.z, normal };
             let out = Touch { distance: -nearest.distance, normal: -nearest.normal };
-            return [if nearest.normal == Vec3::ZERO { vertical } else { out }, Touch::NONE];
+            let is_known = nearest.normal != Vec3::ZERO && nearest.distance > AT_SURFACE;
+            return [if is_known { out } else { vertical }, Touch::NONE];
         }
         if nearest.normal == Vec3::ZERO {
             return [Touch::NONE; 2];
@@ -109,7 +112,7 @@ impl ContactField {
         let mut second = Touch::NONE;
         self.for_each_triangle(centre, radius, |corners| {
             let normal = upward_normal(corners);
-            if normal.dot(first) < DIFFERENT {
+            if normal.dot(first) < MAX_COSINE {
                 let (point, is_in_face) = nearest_point(corners);
                 let distance = point.length();
                 if is_in_face && point.dot(normal) < 0.0 && distance < radius.min(second.distance) {
@@ -275,6 +278,22 @@ mod tests {
         let expected = Vec3::new(-0.01, 0.0, 0.012);
         assert!((touch.distance - expected.length()).abs() < 1e-6, "{touch:?}");
         assert!((touch.normal - expected.normalize()).length() < 1e-4 && none == Touch::NONE, "{touch:?}");
+    }
+
+    /// The corners of a trunk have no radius, so they are at the surface when they touch it.
+    #[test]
+    fn point_at_the_surface_is_pushed_up_and_never_into_the_ground() {
+        let field = step(0.2);
+        for x in [-0.03, -0.3, 0.03, 0.3, 0.01] {
+            let height = field.field.height(x, 0.003);
+            for depth in [1e-9, 1e-7, 1e-6, 1e-5, 5e-5, 2e-4] {
+                for radius in [0.0, RADIUS] {
+                    let [touch, _] = field.touches(Vec3::new(x, 0.003, height - depth), radius);
+                    assert!(touch.distance <= 0.0 && touch.distance > -1e-3, "x = {x}, {depth} m deep: {touch:?}");
+                    assert!(touch.normal.z > 0.0, "x = {x}, {depth} m deep: {touch:?}");
+                }
+            }
+        }
     }
 
     proptest! {

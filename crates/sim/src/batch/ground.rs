@@ -31,7 +31,7 @@ impl<T: SimdFloat> SimdTerrain<T> {
     pub fn contacts_of_point(&self) -> usize {
         match self {
             Self::Plane(_) => 1,
-            Self::Field(_) => MOST_CONTACTS,
+            Self::Field(_) => MAX_CONTACTS,
         }
     }
 
@@ -52,7 +52,7 @@ impl<T: SimdFloat> SimdTerrain<T> {
 }
 
 /// Largest number of contacts of a point.
-const MOST_CONTACTS: usize = 2;
+const MAX_CONTACTS: usize = 2;
 
 /// Ground relative to the base.
 pub struct LocalTerrain<'a, T> {
@@ -107,10 +107,10 @@ impl<T: SimdFloat> LocalTerrain<'_, T> {
     /// Returns the tangent plane of each contact that a sphere about a point of the base frame may have. On a plane only the
     /// first one counts: see [`SimdTerrain::contacts_of_point`].
     #[inline(always)]
-    pub fn contacts(&self, centre: Vec3<T>, radius: T) -> [TangentPlane<T>; MOST_CONTACTS] {
+    pub fn contacts(&self, centre: Vec3<T>, radius: T) -> [TangentPlane<T>; MAX_CONTACTS] {
         match &self.shape {
             LocalShape::Plane { directions, height } => {
-                [TangentPlane { height: *height + directions[0].dot(centre), directions: *directions }; MOST_CONTACTS]
+                [TangentPlane { height: *height + directions[0].dot(centre), directions: *directions }; MAX_CONTACTS]
             }
             LocalShape::Field { field, position, axes } => {
                 contacts_with_field(field, *position + in_world(centre, axes), radius, axes)
@@ -125,9 +125,9 @@ fn contacts_with_field<T: SimdFloat>(
     centre: Vec3<T>,
     radius: T,
     axes: &[Vec3<T>; 3],
-) -> [TangentPlane<T>; MOST_CONTACTS] {
+) -> [TangentPlane<T>; MAX_CONTACTS] {
     let ([x, y, z], up) = (centre.0, Vec3::splat(DVec3::Z));
-    let (mut heights, mut normals) = ([z; MOST_CONTACTS], [up; MOST_CONTACTS]);
+    let (mut heights, mut normals) = ([z; MAX_CONTACTS], [up; MAX_CONTACTS]);
     for lane in 0..T::LANES {
         let centre = DVec3::new(x.get(lane), y.get(lane), z.get(lane)).as_vec3();
         for (contact, touch) in field.touches(centre, radius.get(lane) as f32).into_iter().enumerate() {
