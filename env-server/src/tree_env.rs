@@ -3,7 +3,8 @@
 use glam::{DAffine3, DQuat, Vec3};
 use twinstep_effects::{RobotSampler, TreeModelFile};
 use twinstep_envs::{
-    ControlledRobot, Episode, NoisyEntry, Randomisation, StepOutcome, Task, add_noise, observe_next, repeat_first_frame,
+    ControlledRobot, Course, Episode, NoisyEntry, Randomisation, StepOutcome, Task, add_noise, observe_next,
+    repeat_first_frame,
 };
 use twinstep_model::{
     AgentCommands, AutoresetMode, BackendError, BaseMount, EndedEpisode, EnvError, EnvSpec, GaitCommand, Ground,
@@ -22,6 +23,7 @@ pub struct TreeEnv<T: Task> {
     spec: EnvSpec,
     control: ControlledRobot,
     robot: TreeModel,
+    course: Option<Course>,
     ground: Ground,
     simulation: TreeSimulation,
     randomise: Randomisation,
@@ -80,6 +82,7 @@ impl<T: Task> TreeEnv<T> {
             agent_commands: AgentCommands::default(),
             next_agent_commands: AgentCommands::default(),
             batch: StepBatch::new(num_envs, &spec),
+            course: settings.ground.patches.map(|patches| Course::new(patches, spec.max_episode_steps, num_envs)),
             spec,
             task,
             control,
@@ -99,16 +102,22 @@ impl<T: Task> TreeEnv<T> {
     /// Starts an episode of a robot at rest, and observes it.
     fn start(&mut self, env: usize) -> Result<(), EnvError> {
         let Self { task, episodes, randomise, sampler, robot, simulation, ground, .. } = self;
-        let start = episodes[env].start(task, randomise, |effects, random| {
+        let mut start = episodes[env].start(task, randomise, |effects, random| {
             let sampled = sampler.as_ref().map(|sampler| sampler.sample(effects));
             randomise.sample_tree(sampled.as_ref().unwrap_or(robot), random).or(sampled)
         });
         let q = start.q.into_iter().map(f64::from).collect();
         let model = start.robot.as_ref().unwrap_or(robot);
-        let mut placement = Placement::standing_on(ground, robot, q);
+        let [x, y, _] = self.rows[env].base_position;
+        let walked_to = (!start.is_first).then_some([x, y]);
+        let course = self.course.as_mut();
+        let place = course.map_or([0.0; 3], |course| course.start(env, walked_to, &mut start.place));
+        let mut placement = Placement::standing_at(ground, robot, q, place.map(f64::from));
         placement.base_position[2] += if self.control.standing_height.is_some() { START_CLEARANCE } else { 0.0 };
         simulation.reset(env, model, &placement).map_err(failed)?;
         episodes[env].set_commands(task, &self.agent_commands, env);
+        self.rows[env].read(&self.simulation.states()[env]);
+        self.task.place(&mut self.episodes[env].state, &self.rows[env].view(&self.ground));
         self.observe(env);
         repeat_first_frame(&self.task, row(&mut self.batch.obs, env, self.spec.obs_len()));
         Ok(())
@@ -148,8 +157,11 @@ impl<T: Task> TreeEnv<T> {
 
     /// Writes reward, end flags and observation of a robot whose episode runs.
     fn finish(&mut self, env: usize) {
-        let Self { rows, simulation, episodes, task, spec, ground, .. } = self;
+        let Self { rows, simulation, episodes, task, spec, ground, course, .. } = self;
         let (readings, episode) = (&simulation.states()[env], &mut episodes[env]);
+        if let (Some(course), Some([x, y, _])) = (course, task.velocity_command(&episode.state)) {
+            course.command(env, x.hypot(y) * spec.policy_dt as f32);
+        }
         // A diverged robot keeps its last observation.
         let mut outcome = StepOutcome { truncated: true, ..StepOutcome::default() };
         let is_finite = is_finite(readings);
@@ -220,6 +232,10 @@ impl<T: Task> VecEnv for TreeEnv<T> {
 
     fn critic_obs(&self) -> &[f32] {
         &self.batch.critic_obs
+    }
+
+    fn mean_level(&self) -> Option<f64> {
+        self.course.as_ref().map(Course::mean_level)
     }
 
     fn set_velocity_commands(&mut self, commands: &[VelocityCommand]) -> Result<(), EnvError> {

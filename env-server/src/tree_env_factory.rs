@@ -48,11 +48,8 @@ impl TreeEnvFactory {
                 "a robot of any tree has no actuator networks; use 0",
             ));
         }
-        if matches!(config.sim.terrain, Terrain::Course(_)) {
-            return Err(refused(
-                "sim.terrain",
-                "a course is for quadrupeds like the Go2; use flat ground, a slope, `rough` or `steps`",
-            ));
+        if matches!((config.sim.terrain, &config.task), (Terrain::Course(_), TaskConfig::Pose(_))) {
+            return Err(refused("sim.terrain", "a course is for the task `walk`; `pose` has another ground"));
         }
         let file = match &config.server.model {
             Some(path) => model(path)?,

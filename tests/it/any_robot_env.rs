@@ -5,9 +5,9 @@ use std::sync::Arc;
 
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_env_server::{Config, EnvFactory, SimEnvFactory, TreeEnvFactory};
-use twinstep_envs::{PoseConfig, TaskConfig, check_vec_env};
+use twinstep_envs::{PoseConfig, TaskConfig, WalkConfig, check_vec_env};
 use twinstep_model::{AutoresetMode, ResetRequest, VecEnv};
-use twinstep_sim::{Engine, Terrain};
+use twinstep_sim::{CourseTerrain, Engine, Terrain};
 use twinstep_tests::python::root;
 
 use crate::remote::{config, start_with};
@@ -286,6 +286,32 @@ fn intervals_of_a_model_file_are_sampled_in_each_episode() {
     assert_eq!(sampled[..30], sampled[30..], "one seed is one robot");
     let moved = sampled.iter().zip(&stated).map(|(one, other)| (one - other).abs()).fold(0.0, f32::max);
     assert!(moved > 1e-4, "{moved}: the friction is not that of the file");
+}
+
+/// A course is of 8 m patches; robots start in the middle of theirs, evenly over kinds and levels.
+#[test]
+fn robot_of_another_tree_stands_on_the_patches_of_a_course_and_observes_frames() {
+    let terrain = CourseTerrain { stairs_m: Some([0.05, 0.15]), levels: 2, seed: 1, ..CourseTerrain::default() };
+    let walk = WalkConfig { frames: 2, critic_heights: true, heading_probability: 1.0, ..WalkConfig::default() };
+    for name in ["anymal_c", "spot"] {
+        let mut config = Config { task: TaskConfig::Walk(walk.clone()), ..pose_config(name) };
+        config.sim.terrain = Terrain::Course(terrain);
+        let mut env = TreeEnvFactory::new(&config).unwrap().build(8, AutoresetMode::SameStep, None).unwrap();
+        env.reset(&ResetRequest::seeded(1, 8)).unwrap();
+        assert_eq!((env.spec().obs_len(), env.mean_level()), (2 * 45, Some(0.5)), "{name}");
+        for _ in 0..25 {
+            assert_eq!(env.step(&[0.0; 96]).unwrap().terminated, [false; 8], "{name}");
+        }
+        for robot in 0..8 {
+            let ([x, y, ..], [middle_x, middle_y]) =
+                (env.scene(robot).unwrap().pose[0], terrain.patches().centre(robot / 2 % 2, robot % 2));
+            assert!((x - middle_x).hypot(y - middle_y) < 0.2, "{name}, robot {robot}: {x} {y}");
+        }
+    }
+    let mut pose = pose_config("spot");
+    pose.sim.terrain = Terrain::Course(terrain);
+    let error = TreeEnvFactory::new(&pose).err().unwrap().to_string();
+    assert_eq!(error, "`sim.terrain`: a course is for the task `walk`; `pose` has another ground");
 }
 
 #[test]

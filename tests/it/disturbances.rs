@@ -13,7 +13,7 @@ fn steps(randomise: Randomisation, seed: u64, robots: usize, steps: usize) -> Ve
     let backend = BatchBackend::new(go2(), SimConfig { threads: 1, ..SimConfig::default() }, robots).unwrap();
     let walk = Walk::new(WalkConfig::default(), &go2(), true).unwrap();
     let autoreset = AutoresetMode::NextStep;
-    let settings = TaskEnvConfig { randomise, robot_sampler: None, autoreset, max_episode_steps: None, seed: 0 };
+    let settings = TaskEnvConfig { randomise, ..TaskEnvConfig::new(autoreset, 0) };
     let mut env = TaskEnv::new(backend, walk, settings).unwrap();
     env.reset(&ResetRequest::seeded(seed, robots)).unwrap();
     (0..steps).map(|step| env.step(&vec![0.2 * (0.5 * step as f32).sin(); 12 * robots]).unwrap().clone()).collect()

@@ -1,7 +1,7 @@
 //! The mirror image of a walk is a walk: what `train.symmetry` assumes, in the batch engine.
 
 use twinstep_envs::tasks::walk_config::CommandRanges;
-use twinstep_envs::{Randomisation, TaskEnv, TaskEnvConfig, Walk, WalkConfig, trot};
+use twinstep_envs::{TaskEnv, TaskEnvConfig, Walk, WalkConfig, trot};
 use twinstep_learning::Mirror;
 use twinstep_model::{AutoresetMode, ResetRequest, VecEnv, go2};
 use twinstep_sim::{BatchBackend, SimConfig, Terrain};
@@ -23,13 +23,7 @@ fn robot(command: [f32; 3]) -> TaskEnv<BatchBackend, Walk> {
     let backend =
         BatchBackend::new(go2(), SimConfig { terrain: Terrain::SlopeRad(0.1), threads: 1, ..SimConfig::default() }, 1)
             .unwrap();
-    let settings = TaskEnvConfig {
-        randomise: Randomisation::default(),
-        robot_sampler: None,
-        autoreset: AutoresetMode::SameStep,
-        max_episode_steps: None,
-        seed: 1,
-    };
+    let settings = TaskEnvConfig::new(AutoresetMode::SameStep, 1);
     TaskEnv::new(backend, Walk::new(config, &go2(), true).unwrap(), settings).unwrap()
 }
 

@@ -78,13 +78,8 @@ fn trot(step: usize) -> PerJoint {
 fn robot_stands_for_5_s_of_zero_actions() {
     let Some(python) = Interpreter::of_tests() else { return };
     let walk = Walk::new(WalkConfig::default(), &go2(), true).unwrap();
-    let settings = TaskEnvConfig {
-        randomise: Randomisation { friction_scale: [0.8, 1.2], payload_kg: [0.0, 2.0], ..Randomisation::default() },
-        robot_sampler: None,
-        autoreset: AutoresetMode::NextStep,
-        max_episode_steps: None,
-        seed: 1,
-    };
+    let randomise = Randomisation { friction_scale: [0.8, 1.2], payload_kg: [0.0, 2.0], ..Randomisation::default() };
+    let settings = TaskEnvConfig { randomise, ..TaskEnvConfig::new(AutoresetMode::NextStep, 1) };
     let mut env = TaskEnv::new(python.backend(go2(), config(), 3), walk, settings).unwrap();
     env.reset(&ResetRequest::seeded(7, 3)).unwrap();
     for step in 0..250 {
@@ -103,13 +98,7 @@ fn robot_stands_for_5_s_of_zero_actions() {
 fn walk_over_steps<B: Backend>(backend: B) -> (f32, usize) {
     let (policy, _) = Policy::read(root().join("data/policies/walk_robust.safetensors")).unwrap();
     let (walk, robots) = (Walk::new(WalkConfig::default(), &go2(), true).unwrap(), backend.num_robots());
-    let settings = TaskEnvConfig {
-        randomise: Randomisation::default(),
-        robot_sampler: None,
-        autoreset: AutoresetMode::Disabled,
-        max_episode_steps: None,
-        seed: 1,
-    };
+    let settings = TaskEnvConfig::new(AutoresetMode::Disabled, 1);
     let mut env = TaskEnv::new(backend, walk, settings).unwrap();
     env.set_velocity_commands(&vec![[0.5, 0.0, 0.0]; robots]).unwrap();
     let mut obs = env.reset(&ResetRequest::seeded(3, robots)).unwrap().to_vec();
@@ -296,14 +285,7 @@ fn check_divergence(backend: &mut MujocoBackend) {
 fn killed_process_is_an_error_of_every_later_request() {
     let Some(python) = Interpreter::of_tests() else { return };
     let walk = Walk::new(WalkConfig::default(), &go2(), true).unwrap();
-    let (autoreset, robot_sampler) = (AutoresetMode::NextStep, None);
-    let settings = TaskEnvConfig {
-        randomise: Randomisation::default(),
-        robot_sampler,
-        autoreset,
-        max_episode_steps: None,
-        seed: 1,
-    };
+    let settings = TaskEnvConfig::new(AutoresetMode::NextStep, 1);
     let backend = python.backend(go2(), config(), 1);
     let id = backend.process_id().to_string();
     let mut env = TaskEnv::new(backend, walk, settings).unwrap();

@@ -3,7 +3,7 @@
 use glam::{Quat, Vec3};
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_env_server::{Config, EnvFactory, SimEnvFactory};
-use twinstep_envs::{Randomisation, TaskConfig, TaskEnv, TaskEnvConfig, Walk, WalkConfig};
+use twinstep_envs::{TaskConfig, TaskEnv, TaskEnvConfig, Walk, WalkConfig};
 use twinstep_model::{
     AutoresetMode, Backend, Command, Ground, InitialState, NUM_LEGS, Pose, ResetRequest, Scene, SceneShape, ShapeKind,
     Simulator, VecEnv, body_poses, frames, go2,
@@ -147,13 +147,7 @@ fn foot_that_is_driven_against_stairs_stays_outside_of_them() {
     let (policy, _) = Policy::read(root().join("data/policies/walk_robust.safetensors")).unwrap();
     let sim = SimConfig { terrain: course([0.2; 2], 1), threads: 1, ..SimConfig::default() };
     let walk = Walk::new(WalkConfig { min_base_height_m: Some(-10.0), ..WalkConfig::default() }, &go2(), true).unwrap();
-    let settings = TaskEnvConfig {
-        randomise: Randomisation::default(),
-        robot_sampler: None,
-        autoreset: AutoresetMode::SameStep,
-        max_episode_steps: None,
-        seed: 1,
-    };
+    let settings = TaskEnvConfig::new(AutoresetMode::SameStep, 1);
     let mut env = TaskEnv::new(BatchBackend::new(go2(), sim, 8).unwrap(), walk, settings).unwrap();
     env.set_velocity_commands(&[[0.8, 0.0, 0.0]; 8]).unwrap();
     let mut obs = env.reset(&ResetRequest::seeded(1, 8)).unwrap().to_vec();

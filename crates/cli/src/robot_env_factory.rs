@@ -1,7 +1,7 @@
 //! Builds environments on the real robot.
 
 use twinstep_env_server::{EnvFactory, EnvFactoryError, task_env, task_spec};
-use twinstep_envs::{Randomisation, TaskConfig, TaskEnvConfig};
+use twinstep_envs::{TaskConfig, TaskEnvConfig};
 use twinstep_model::{AutoresetMode, RobotModel, VecEnv};
 use twinstep_protocol::message::RealTime;
 use twinstep_robot::{RobotBackend, RobotHandle};
@@ -32,13 +32,7 @@ impl EnvFactory for RobotEnvFactory {
         autoreset: AutoresetMode,
         max_episode_steps: Option<u32>,
     ) -> Result<Box<dyn VecEnv>, EnvFactoryError> {
-        let settings = TaskEnvConfig {
-            randomise: Randomisation::default(),
-            robot_sampler: None,
-            autoreset,
-            max_episode_steps,
-            seed: 0,
-        };
+        let settings = TaskEnvConfig { max_episode_steps, ..TaskEnvConfig::new(autoreset, 0) };
         let backend = RobotBackend::new(self.robot.clone(), self.handle.clone());
         task_env(&self.task, backend, settings)
     }

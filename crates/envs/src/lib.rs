@@ -4,6 +4,7 @@
 //!   per task; [`TaskConfig`] is the `[task]` table of a config file.
 //! - [`ControlledRobot`]: the robot as tasks see it, of any tree: its joints, gains and pose, its feet and its size.
 //! - [`TaskEnv`]: a task on all robots of a backend, as a [`twinstep_model::VecEnv`].
+//! - [`Course`]: the levels of robots on ground of several kinds.
 //! - [`Path`]: a reference that moves along arcs on the ground, for the task `track`.
 //! - [`Randomisation`]: the `[randomise]` table; each episode has its own robot, is pushed, and observes with
 //!   [`ObservationNoise`].
@@ -33,6 +34,7 @@ pub use check::{CheckError, check_vec_env};
 pub use config::{ConfigError, over_defaults};
 pub use controlled_robot::ControlledRobot;
 pub use counter::{Counter, CounterEnv};
+pub use course::Course;
 pub use episode::{Episode, EpisodeStart, StepOutcome};
 pub use observation::{CRITIC_OBS_LEN, OBS_LEN, base_spec, observe, observe_privileged, privileged_fields};
 pub use observation_noise::{NoisyEntry, ObservationNoise, add_noise};

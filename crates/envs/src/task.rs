@@ -16,6 +16,9 @@ pub trait Task: Send {
     /// Starts an episode. Returns the initial joint positions [rad] and the state.
     fn start(&self, random: &mut Stream) -> (Vec<f32>, Self::State);
 
+    /// Completes the state of an episode whose robot is in place.
+    fn place(&self, _state: &mut Self::State, _robot: &RobotView) {}
+
     /// Returns how many frames the observation has: the present one, and earlier ones, which [`crate::TaskEnv`] keeps.
     fn frames(&self) -> usize {
         1

@@ -32,6 +32,13 @@ pub struct TaskEnvConfig {
     pub seed: u64,
 }
 
+impl TaskEnvConfig {
+    /// Returns the settings of environments of the backend's robot without disturbances, with the episodes of the task.
+    pub fn new(autoreset: AutoresetMode, seed: u64) -> Self {
+        Self { randomise: Randomisation::default(), robot_sampler: None, autoreset, max_episode_steps: None, seed }
+    }
+}
+
 /// Vectorised environments of a task on a backend.
 pub struct TaskEnv<B: Backend, T: Task> {
     backend: B,
@@ -73,7 +80,7 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
             noise: randomise.noise.entries(&spec),
             randomise,
             robots,
-            course: backend.ground().patches.map(|patches| Course::new(patches, num_envs)),
+            course: backend.ground().patches.map(|patches| Course::new(patches, spec.max_episode_steps, num_envs)),
             ground: backend.ground(),
             autoreset,
             episodes: (0..num_envs as u64).map(not_started).collect(),
@@ -128,6 +135,8 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
                 Some(robot) => backend.reset_with_model(*env, &robot, &initial_state)?,
                 None => backend.reset(&[(*env, initial_state)])?,
             }
+            let robot = view(&self.backend, &self.ground, *env);
+            self.task.place(&mut self.episodes[*env].state, &robot);
             self.follow_robot(*env);
             self.observe(*env);
             repeat_first_frame(&self.task, row(&mut self.batch.obs, *env, self.spec.obs_len()));

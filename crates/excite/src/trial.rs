@@ -1,6 +1,6 @@
 //! A policy that follows command sequences in a simulator, recorded as logs.
 
-use twinstep_envs::{ConfigError, GaitConfig, GaitTask, Randomisation, Task, TaskEnv, TaskEnvConfig, Walk, WalkConfig};
+use twinstep_envs::{ConfigError, GaitConfig, GaitTask, Task, TaskEnv, TaskEnvConfig, Walk, WalkConfig};
 use twinstep_logs::{Gain, Log, LogError, Meta, Segment, TorqueSensor};
 use twinstep_model::{
     AutoresetMode, Backend, BaseMount, EnvError, EnvSpec, JOINT_NAMES, NUM_JOINTS, PerJoint, ResetRequest, RobotStates,
@@ -128,13 +128,7 @@ pub fn gait_env<B: Backend>(backend: B, seed: u64) -> Result<TaskEnv<B, GaitTask
 }
 
 fn calm(seed: u64) -> TaskEnvConfig {
-    TaskEnvConfig {
-        randomise: Randomisation::default(),
-        robot_sampler: None,
-        autoreset: AutoresetMode::NextStep,
-        max_episode_steps: Some(u32::MAX),
-        seed,
-    }
+    TaskEnvConfig { max_episode_steps: Some(u32::MAX), ..TaskEnvConfig::new(AutoresetMode::NextStep, seed) }
 }
 
 /// Lets `policy` follow one sequence on each robot of `env`, all of which start in the same state, drawn from `seed`.

@@ -54,13 +54,22 @@ impl Placement {
     /// Returns the state at rest with the joints at `q`: a fixed base where its file has it, a free one upright above the origin, with the
     /// contact points of the robot on or above the ground.
     pub fn standing_on(ground: &Ground, robot: &TreeModel, q: Vec<f64>) -> Self {
+        Self::standing_at(ground, robot, q, [0.0; 3])
+    }
+
+    /// Returns the state as [`Placement::standing_on`] does, with a free base above another point of the ground: x [m], y [m], and
+    /// the yaw of the robot [rad].
+    pub fn standing_at(ground: &Ground, robot: &TreeModel, q: Vec<f64>, [x, y, yaw]: [f64; 3]) -> Self {
         let mut state = Self::of(&robot.tree, q);
         if robot.tree.base.is_some_and(BaseMount::is_fixed) {
             return state;
         }
-        let poses = robot.tree.base_from_bodies(&state.q);
+        let (poses, turn) = (robot.tree.base_from_bodies(&state.q), DQuat::from_rotation_z(yaw));
+        state.base_orientation = [turn.w, turn.x, turn.y, turn.z];
+        [state.base_position[0], state.base_position[1]] = [x, y];
         let needed = robot.points.iter().map(|point| {
-            let DVec3 { x, y, z } = poses[point.body].transform_point3(point.centre);
+            let centre = turn * poses[point.body].transform_point3(point.centre);
+            let DVec3 { x, y, z } = centre + DVec3::new(x, y, 0.0);
             f64::from(ground.height(x as f32, y as f32)) + point.radius - z
         });
         let height = needed.fold(f64::NEG_INFINITY, f64::max);
@@ -128,7 +137,14 @@ mod tests {
         let flat = Placement::standing_on(&Ground::FLAT, &robot, q.clone()).base_position[2];
         assert!((flat - robot.tree.standing_height(&q)).abs() < 1e-9);
         let raised = Ground { point: [0.0, 0.0, 0.3], ..Ground::FLAT };
-        let height = Placement::standing_on(&raised, &robot, q).base_position[2];
+        let height = Placement::standing_on(&raised, &robot, q.clone()).base_position[2];
         assert!((height - flat - 0.3).abs() < 1e-6, "{height}");
+        let slope = Ground { normal: [-0.2f32.sin(), 0.0, 0.2f32.cos()], ..Ground::FLAT };
+        let here = Placement::standing_on(&slope, &robot, q.clone()).base_position[2];
+        let there = Placement::standing_at(&slope, &robot, q, [2.0, -1.0, std::f64::consts::PI]);
+        assert_eq!(there.base_position[..2], [2.0, -1.0]);
+        assert!((there.base_orientation[3] - 1.0).abs() < 1e-9, "{:?}", there.base_orientation);
+        // Turned round, the rear feet are ahead: the robot is nearly as long behind its base as before it.
+        assert!((there.base_position[2] - here - 2.0 * 0.2f64.tan()).abs() < 0.03, "{there:?}");
     }
 }

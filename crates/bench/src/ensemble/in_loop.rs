@@ -2,7 +2,7 @@
 
 use twinstep_effects::{ActuatorNetworkConfig, MemberSampling, ModelFile};
 use twinstep_ensemble::ActuatorNetworkRobot;
-use twinstep_envs::{Randomisation, TaskEnv, TaskEnvConfig, Walk, WalkConfig};
+use twinstep_envs::{TaskEnv, TaskEnvConfig, Walk, WalkConfig};
 use twinstep_model::{AutoresetMode, ResetRequest, VecEnv, go2};
 use twinstep_sim::{BatchBackend, SimConfig};
 
@@ -74,13 +74,7 @@ fn walking(actuators: ActuatorKind, robots: usize) -> Result<impl FnMut() -> Res
         ActuatorKind::NetworkPerEpisode => backend.with_actuator(Box::new(learned.actuators(robots, false))),
         ActuatorKind::NetworkPerStep => backend.with_actuator(Box::new(learned.actuators(robots, true))),
     };
-    let settings = TaskEnvConfig {
-        randomise: Randomisation::default(),
-        robot_sampler: None,
-        autoreset: AutoresetMode::NextStep,
-        max_episode_steps: None,
-        seed: 1,
-    };
+    let settings = TaskEnvConfig::new(AutoresetMode::NextStep, 1);
     let walk = Walk::new(WalkConfig::default(), &go2(), true).map_err(failed)?;
     let mut envs = TaskEnv::new(backend, walk, settings).map_err(failed)?;
     envs.reset(&ResetRequest::seeded(1, robots)).map_err(failed)?;

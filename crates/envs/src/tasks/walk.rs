@@ -201,6 +201,10 @@ impl Task for Walk {
         (q, WalkState { command, heading, steps_to_command, contacts: FootContacts::default() })
     }
 
+    fn place(&self, state: &mut WalkState, robot: &RobotView) {
+        self.follow_heading(state, robot);
+    }
+
     fn frames(&self) -> usize {
         self.config.frames
     }

@@ -9,8 +9,6 @@ use super::robot::Robot;
 /// Mass above which a payload changes the inertia of a body, too [kg], if it is no farther from the body's origin than this [m].
 const LEAST_PAYLOAD: f64 = 0.05;
 const LONGEST_ARM: f64 = 0.5;
-/// Mass that columns are computed with at least, relative to a body's own: less is no body, and [`is_physical`] refuses it.
-const LEAST_MASS: f64 = 0.1;
 /// Least factor on the second moment of a body along an axis.
 const LEAST_MOMENT: f64 = 0.1;
 
@@ -37,7 +35,11 @@ pub fn apply(robot: &mut Robot, law: &Law, site: Site, unknowns: &[f64], shape: 
         ("payload", site) => {
             // The unknowns are mass and first moment, in which forces are nearly linear.
             let body = &mut robot.tree.bodies[body_of(site)].inertia;
-            let mass = unknowns[0].max((LEAST_MASS - 1.0) * body.mass);
+            let mass = unknowns[0];
+            if body.mass + mass <= 0.0 {
+                // There is no such body, and [`is_physical`] refuses the cause.
+                return;
+            }
             let moment = DVec3::new(unknowns[1], unknowns[2], unknowns[3]);
             if mass.abs() > LEAST_PAYLOAD && (moment / mass).length() < LONGEST_ARM {
                 *body = body.with_point_mass(mass, moment / mass);
