@@ -7,7 +7,7 @@ use std::process::Command;
 use twinstep_effects::CATALOGUE;
 
 /// Crate folders and the workspace crates that each may use. Leaf crates use only the core; applications combine them.
-const MAY_USE: [(&str, &[&str]); 32] = [
+const MAY_USE: [(&str, &[&str]); 33] = [
     // Core.
     ("crates/files", &[]),
     ("crates/simd", &[]),
@@ -59,12 +59,10 @@ const MAY_USE: [(&str, &[&str]); 32] = [
         ],
     ),
     (
-        "crates/cli",
+        "crates/workflows",
         &[
             "files",
-            "simd",
             "model",
-            "robot-files",
             "effects",
             "logs",
             "protocol",
@@ -80,14 +78,38 @@ const MAY_USE: [(&str, &[&str]); 32] = [
             "learning",
             "measures",
             "agent",
+            "report",
+            "excite",
+            "viewer",
+        ],
+    ),
+    (
+        "crates/cli",
+        &[
+            "files",
+            "simd",
+            "model",
+            "robot-files",
+            "effects",
+            "logs",
+            "protocol",
+            "sim",
+            "envs",
+            "identify",
+            "inference",
+            "ensemble",
+            "env-server",
+            "client",
+            "policy",
+            "measures",
+            "agent",
             "robot",
-            "unitree",
-            "session",
             "report",
             "excite",
             "hunt",
             "bench",
             "viewer",
+            "workflows",
         ],
     ),
     ("examples", &["model", "robot-files", "sim", "env-server", "client"]),

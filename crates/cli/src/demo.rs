@@ -16,7 +16,9 @@ use twinstep_policy::{Policy, PolicyRunner};
 use twinstep_report::{film_strip, joint_plot, joint_table};
 use twinstep_sim::BatchRollout;
 
-use crate::diagnose;
+use twinstep_workflows::{DiagnoseOptions, TrainConfig, TrainOptions};
+
+use crate::diagnose::diagnose_and_print;
 use crate::exit::{CommandResult, Signals, input, other};
 use crate::train;
 use crate::web_view::ViewArgs;
@@ -52,10 +54,13 @@ pub struct Args {
 /// Runs the parts of the demo.
 pub fn run(args: &Args) -> CommandResult {
     eprintln!("1. A Go2 learns to walk: {:.1} million steps of 1024 robots.", args.train_steps as f64 / 1e6);
-    let training = train::Args::new(args.out.join("walk"), 1, args.train_steps, ViewArgs::default_page());
+    let mut config = TrainConfig::default();
+    config.train.total_steps = args.train_steps;
+    let page = ViewArgs::default_page();
+    let training = TrainOptions { page, ..TrainOptions::new(args.out.join("walk"), config, 1) };
     // The demo repeats its own training.
     training.remove_checkpoint().map_err(other)?;
-    train::run(&training)?;
+    train::train_and_print(&training, false)?;
     let signals = Signals::listen()?;
     walk(args, &training.policy(), &signals)?;
     compare(&args.out, &signals)
@@ -118,5 +123,5 @@ fn compare(out: &Path, signals: &Signals) -> CommandResult {
     println!("measured and simulated position of each joint: {}", picture.display());
     println!("recording, as a log folder: {}", folder.display());
     eprintln!("\n4. Diagnosis: which effects explain the difference?");
-    diagnose::run(&diagnose::Args::new(folder, out.join("diagnosis")))
+    diagnose_and_print(&DiagnoseOptions::new(vec![folder], out.join("diagnosis")), false)
 }

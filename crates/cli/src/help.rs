@@ -11,7 +11,7 @@ const GROUPS: [(&str, &[&str]); 4] = [
     ),
     (
         "Compare the simulation with measurements, and correct it",
-        &["log", "play", "evaluate", "diagnose", "identify", "excite", "spi-active", "fit", "u2e"],
+        &["log", "play", "evaluate", "diagnose", "identify", "adapt", "excite", "spi-active", "fit", "u2e"],
     ),
     ("Look up and check", &["effects", "mjcf", "hunt", "bench"]),
 ];

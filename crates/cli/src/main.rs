@@ -1,9 +1,7 @@
 //! Command line `twinstep`, with one file per subcommand.
 
-mod ambiguous_effects;
+mod adapt;
 mod bench;
-mod command_env;
-mod cross_evaluation;
 mod demo;
 mod diagnose;
 mod effects;
@@ -18,48 +16,29 @@ mod frame_feed;
 mod help;
 mod hunt;
 mod identify;
-mod identify_tree;
 mod import_policy;
 mod key_terminal;
-mod learned_residual;
 mod line_printer;
 mod list;
 mod log;
 mod log_writer;
-mod measure_tables;
 mod mjcf;
 mod onboard_policy;
-mod open_log;
 mod operator;
 mod operator_screen;
 mod play;
-mod player;
 mod preflight;
-mod random_commands;
 mod rehearsal;
 mod robot;
 mod robot_env_factory;
-mod robot_file;
 mod robot_view;
 mod run;
 mod run_view;
 mod serve;
 mod spi_active;
-mod spi_active_config;
-mod spi_active_report;
-mod stages;
-mod status_line;
 mod stop_signals;
 mod train;
-mod train_config;
-mod train_endpoints;
-mod train_evaluation;
-mod train_log;
-mod tree_model;
 mod u2e;
-mod u2e_config;
-mod u2e_evaluation;
-mod u2e_report;
 mod velocity_input;
 mod view;
 mod view_endpoint;
@@ -83,6 +62,7 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum CliCommand {
+    Adapt(adapt::Args),
     Bench(bench::Args),
     Demo(demo::Args),
     Diagnose(diagnose::Args),
@@ -128,6 +108,7 @@ fn main() -> std::process::ExitCode {
         .with_writer(|| log_writer::LogWriter)
         .init();
     let result = InstructionSet::from_environment().map_err(exit::input).and_then(|_| match command {
+        CliCommand::Adapt(args) => adapt::run(&args),
         CliCommand::Bench(args) => bench::run(&args),
         CliCommand::Demo(args) => demo::run(&args),
         CliCommand::Diagnose(args) => diagnose::run(&args),

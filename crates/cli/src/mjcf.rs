@@ -10,8 +10,8 @@ use twinstep_robot_files::{QuadrupedNames, TreeMjcf, quadruped, read_robot, writ
 use twinstep_sim::effect_outside_mujoco;
 
 use crate::exit::{CommandResult, Failure, input, other};
-use crate::robot_file::robot_model;
-use crate::tree_model::of_any_tree;
+use twinstep_workflows::robot_file::robot_model;
+use twinstep_workflows::tree_model::of_any_tree;
 
 /// Allowed time steps [s].
 const TIMESTEPS: std::ops::RangeInclusive<f64> = 1e-5..=0.02;

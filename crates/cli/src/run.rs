@@ -1,19 +1,16 @@
 //! `twinstep run`: runs a policy on a robot and records a log.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use serde::Serialize;
-use twinstep_agent::{
-    AgentError, BoundPolicy, Control, JointRecorder, LoadedPolicy, Recorder, Recorders, RunPlan, RunSummary, Status,
-    WantedCommands, run as run_policy,
-};
-use twinstep_client::{ConnectOptions, RemoteVecEnv};
-use twinstep_excite::CommandSequence;
-use twinstep_model::{AutoresetMode, ResetRequest, VecEnv};
+use twinstep_agent::{Control, RunSummary, Status, WantedCommands};
+use twinstep_client::RemoteVecEnv;
+use twinstep_model::{ResetRequest, VecEnv};
+use twinstep_workflows::record::{Pilot, record_with};
+use twinstep_workflows::{Observer, RecordOptions, Recording, Velocity};
 
-use crate::exit::{CommandResult, Failure, Signals, input, other};
+use crate::exit::{CommandResult, Failure, other};
 use crate::run_view::RunView;
-use crate::status_line::StatusLine;
 use crate::velocity_input::VelocityInput;
 use crate::web_view::ViewArgs;
 
@@ -104,27 +101,14 @@ struct Report<'a> {
     summary: &'a RunSummary,
 }
 
-/// Source of the velocity command.
-enum Velocity {
-    Endpoint,
-    Constant([f32; 3]),
-    Sequence(CommandSequence),
-    Person(VelocityInput),
-}
-
-/// What a run needs beside the robot.
-struct Prepared {
-    policy: BoundPolicy,
-    recorder: Option<Recorder>,
-    joints: Option<JointRecorder>,
-    velocity: Velocity,
-    view: Option<RunView>,
-}
-
 /// Runs the policy and prints the summary.
 pub fn run(args: &Args) -> CommandResult {
-    let signals = Signals::listen()?;
-    let Recording { robot, task, summary } = record(args, &signals)?;
+    let observer = Observer::terminal()?;
+    // Read and checked before anything moves.
+    args.view.check()?;
+    let options = args.options()?;
+    let open = |env: &mut RemoteVecEnv| args.driver(env, options.velocity.clone());
+    let Recording { robot, task, summary } = record_with(&options, open, &observer)?;
     if args.json {
         let report =
             Report { policy: &args.policy, endpoint: &args.endpoint, robot: &robot, task: &task, summary: &summary };
@@ -135,210 +119,68 @@ pub fn run(args: &Args) -> CommandResult {
     Ok(())
 }
 
-/// A run, which may have a log.
-pub struct Recording {
-    robot: String,
-    task: String,
-    /// What the robot did.
-    pub summary: RunSummary,
+/// Commands the run and shows it.
+struct Driver {
+    velocity: Velocity,
+    person: Option<VelocityInput>,
+    view: Option<RunView>,
 }
 
-/// Runs the policy and records the log.
-pub fn record(args: &Args, signals: &Signals) -> Result<Recording, Failure> {
-    if let Some(seconds) = args.seconds.filter(|seconds| !(seconds.is_finite() && *seconds > 0.0)) {
-        return Err(Failure::Input(miette::miette!("`--seconds` = {seconds} is not allowed: it must be positive")));
+impl Pilot for Driver {
+    fn control(&mut self, status: &Status, env: &dyn VecEnv) -> Control {
+        if let Some(view) = &self.view {
+            view.show(status, env);
+        }
+        let step = |velocity| Control::Step(WantedCommands::velocity(Some(velocity)));
+        if let Some(person) = &self.person {
+            return person.command().map_or(Control::End, step);
+        }
+        // The page has sliders only if there is no other source.
+        self.view.as_ref().and_then(RunView::velocity).map_or_else(|| self.velocity.at(status.seconds), step)
     }
-    if !(0.0..=1.0).contains(&args.action_noise) {
-        let noise = args.action_noise;
-        return Err(Failure::Input(miette::miette!("`--action-noise` = {noise} is not allowed: 0 to 1")));
+
+    fn failure(&self) -> Option<String> {
+        self.person.as_ref().and_then(VelocityInput::failure)
     }
-    // Read and checked before anything moves.
-    args.view.check()?;
-    let commands = args.commands.as_deref().map(read_commands).transpose()?;
-    let loaded = LoadedPolicy::read(&args.policy, args.mapping.as_deref()).map_err(input)?;
-    let mut env = RemoteVecEnv::connect(&args.options(signals)).map_err(|error| interrupted(signals, error))?;
-    let Prepared { mut policy, mut recorder, mut joints, velocity, view } =
-        match args.prepared(&mut env, loaded, commands, signals) {
-            Ok(prepared) => prepared,
-            Err(failure) => {
-                if matches!(failure, Failure::Input(_)) {
-                    // Otherwise the robot is taken until the grace period has passed.
-                    let _ = env.close();
-                }
-                return Err(failure);
-            }
-        };
-    let recorders = Recorders { steps: recorder.as_mut(), joints: joints.as_mut() };
-    let result = args.steps(&mut env, &mut policy, recorders, (&velocity, view.as_ref()), signals);
-    let device_failure = if let Velocity::Person(device) = &velocity { device.failure() } else { None };
-    // Restores the terminal before anything is printed.
-    drop(velocity);
-    if let Some(folder) = &args.log {
-        let rows = recorder.map_or(0, |recorder| recorder.rows()) + joints.map_or(0, |joints| joints.rows());
-        eprintln!("{rows} rows in {}", folder.display());
-    }
-    let (robot, task) = (env.spec().robot.clone(), env.spec().task.clone());
-    // Otherwise the robot is taken until the grace period has passed. After another error the server may be gone.
-    if matches!(result, Ok(_) | Err(AgentError::RobotStopped { .. })) {
-        // Its error is of no interest any more: the run has ended.
-        let _ = env.close();
-    }
-    let summary = result.map_err(|error| interrupted(signals, error))?;
-    if let Some(reason) = device_failure {
-        return Err(Failure::Other(miette::Report::msg(reason)));
-    }
-    if args.seconds.is_some() {
-        // Ctrl-C before the end is an interruption; without --seconds it is the end.
-        signals.check()?;
-    }
-    Ok(Recording { robot, task, summary })
 }
 
 impl Args {
-    /// Returns the arguments with which `policy` follows the commands in a file for some time [s] and records `log`.
-    pub fn recording(policy: &Path, commands: &Path, log: &Path, seconds: f64) -> Self {
-        Self {
-            policy: policy.to_owned(),
-            mapping: None,
-            endpoint: String::new(),
-            robot: None,
-            zenoh: None,
-            log: Some(log.to_owned()),
-            torque: false,
-            velocity: None,
-            commands: Some(commands.to_owned()),
-            keyboard: false,
-            gamepad: None,
-            seconds: Some(seconds),
-            action_noise: 0.0,
-            go_on: false,
-            fast: false,
-            seed: 1,
-            json: false,
-            view: ViewArgs::default(),
-        }
-    }
-
-    fn options(&self, signals: &Signals) -> ConnectOptions {
-        ConnectOptions {
-            interrupted: signals.flag(),
+    fn options(&self) -> Result<RecordOptions, Failure> {
+        let velocity = match (&self.velocity, &self.commands) {
+            (Some(velocity), _) => Velocity::Constant(*velocity),
+            (None, Some(path)) => Velocity::from_file(path)?,
+            (None, None) => Velocity::Endpoint,
+        };
+        Ok(RecordOptions {
+            mapping: self.mapping.clone(),
             robot: self.robot.clone(),
             zenoh: self.zenoh.clone(),
-            autoreset: AutoresetMode::Disabled,
-            // No time limit: SPEC.md.
-            max_episode_steps: Some(u32::MAX),
-            critic: true,
-            ..ConnectOptions::new(self.endpoint.as_str(), 1)
-        }
-    }
-
-    /// Compares the policy with the robot, and opens the log, the source of commands and the view.
-    fn prepared(
-        &self,
-        env: &mut RemoteVecEnv,
-        loaded: LoadedPolicy,
-        commands: Option<CommandSequence>,
-        signals: &Signals,
-    ) -> Result<Prepared, Failure> {
-        let policy = loaded.bind(env.spec()).map_err(input)?;
-        if let Some(velocity) = self.velocity {
-            env.set_velocity_commands(&[velocity]).map_err(input)?;
-        }
-        let (recorder, joints) = self.recorders(env, signals)?;
-        let velocity = self.velocity_source(commands)?;
-        if self.view.is_wanted() && self.log.is_none() {
-            env.reset(&ResetRequest::seeded(self.seed, 1)).map_err(|error| interrupted(signals, error))?;
-        }
-        let view = RunView::open(&self.view, env, matches!(velocity, Velocity::Endpoint))?;
-        Ok(Prepared { policy, recorder, joints, velocity, view })
-    }
-
-    /// Creates the log, if there is to be one.
-    fn recorders(
-        &self,
-        env: &mut RemoteVecEnv,
-        signals: &Signals,
-    ) -> Result<(Option<Recorder>, Option<JointRecorder>), Failure> {
-        let Some(folder) = &self.log else { return Ok((None, None)) };
-        env.reset(&ResetRequest::seeded(self.seed, 1)).map_err(|error| interrupted(signals, error))?;
-        let has_scene = match env.scene(0) {
-            Ok(_) => true,
-            Err(error) => {
-                eprintln!("the log has no orientation, because the endpoint gives no scene: {error}");
-                false
-            }
-        };
-        let (policy, spec) = (self.policy.display(), env.spec());
-        let source = format!("twinstep run {policy} on `{}`, task `{}`, at {}", spec.robot, spec.task, self.endpoint);
-        if self.torque {
-            // A simulator alone gives what no sensor measures.
-            let has_base = spec.critic_field("true_linear_velocity").is_some() && !env.is_real_time();
-            return Ok((None, Some(JointRecorder::create(folder, env, has_base, &source).map_err(input)?)));
-        }
-        Ok((Some(Recorder::create(folder, spec, has_scene, &source).map_err(input)?), None))
-    }
-
-    fn velocity_source(&self, commands: Option<CommandSequence>) -> Result<Velocity, Failure> {
-        if let Some(commands) = commands {
-            return Ok(Velocity::Sequence(commands));
-        }
-        Ok(match (&self.velocity, &self.gamepad) {
-            (Some(velocity), _) => Velocity::Constant(*velocity),
-            (None, Some(device)) => Velocity::Person(VelocityInput::gamepad(device)?),
-            (None, None) if self.keyboard => Velocity::Person(VelocityInput::keyboard()?),
-            (None, None) => Velocity::Endpoint,
+            log: self.log.clone(),
+            torque: self.torque,
+            velocity,
+            seconds: self.seconds,
+            action_noise: self.action_noise,
+            go_on: self.go_on,
+            fast: self.fast,
+            seed: self.seed,
+            ..RecordOptions::new(&self.policy, &self.endpoint)
         })
     }
 
-    fn steps(
-        &self,
-        env: &mut RemoteVecEnv,
-        policy: &mut BoundPolicy,
-        recorders: Recorders,
-        (velocity, view): (&Velocity, Option<&RunView>),
-        signals: &Signals,
-    ) -> Result<RunSummary, AgentError> {
-        let (mut line, mut falls) = (StatusLine::new(), 0);
-        // A robot sets the pace itself.
-        let real_time = !self.fast && !env.is_real_time();
-        let plan = RunPlan {
-            seconds: self.seconds,
-            real_time,
-            action_noise: self.action_noise,
-            seed: self.seed,
-            goes_on: self.go_on,
+    /// Opens the source of commands and the view.
+    fn driver(&self, env: &mut RemoteVecEnv, velocity: Velocity) -> Result<Driver, Failure> {
+        let person = match &self.gamepad {
+            Some(device) => Some(VelocityInput::gamepad(device)?),
+            None if self.keyboard => Some(VelocityInput::keyboard()?),
+            None => None,
         };
-        let mut control = |status: &Status, env: &dyn VecEnv| {
-            if status.falls > falls {
-                falls = status.falls;
-                line.message(&format!("{:.2} s: the robot has fallen and is reset", status.seconds));
-            }
-            line.show(|| status_text(status));
-            view.inspect(|view| view.show(status, env));
-            if !matches!(signals.check(), Ok(false)) {
-                return Control::End;
-            }
-            let step = |velocity| Control::Step(WantedCommands::velocity(velocity));
-            match velocity {
-                Velocity::Endpoint => step(view.and_then(RunView::velocity)),
-                Velocity::Constant(command) => step(Some(*command)),
-                Velocity::Sequence(sequence) if status.seconds > sequence.duration_s() - 1e-6 => Control::End,
-                Velocity::Sequence(sequence) => Control::Step(WantedCommands {
-                    velocity: Some(sequence.at(status.seconds)),
-                    gait: sequence.gait_at(status.seconds),
-                }),
-                Velocity::Person(device) => device.command().map_or(Control::End, |command| step(Some(command))),
-            }
-        };
-        let result = run_policy(env, policy, recorders, plan, &mut control);
-        line.clear();
-        result
+        if self.view.is_wanted() && self.log.is_none() {
+            env.reset(&ResetRequest::seeded(self.seed, 1)).map_err(other)?;
+        }
+        let steers = person.is_none() && velocity == Velocity::Endpoint;
+        let view = RunView::open(&self.view, env, steers)?;
+        Ok(Driver { velocity, person, view })
     }
-}
-
-/// Returns the failure of an error, which an interruption may have caused.
-fn interrupted(signals: &Signals, error: impl std::error::Error + Send + Sync + 'static) -> Failure {
-    signals.check().err().unwrap_or_else(|| other(error))
 }
 
 /// Parses `VX,VY,WZ`.
@@ -347,21 +189,6 @@ fn velocity(text: &str) -> Result<[f32; 3], String> {
     numbers.ok().and_then(|numbers| <[f32; 3]>::try_from(numbers).ok()).ok_or_else(|| {
         "three numbers are expected: forward [m/s], left [m/s], yaw rate [rad/s], such as 0.5,0,0".to_owned()
     })
-}
-
-fn status_text(status: &Status) -> String {
-    let vector = |name: &str, value: Option<[f32; 3]>| {
-        value.map_or_else(String::new, |[x, y, yaw]| format!("{name} {x:+.2} {y:+.2} m/s {yaw:+.2} rad/s   "))
-    };
-    format!(
-        "{:7.2} s   {}{}falls {}   step {:.1} ms, late {:.1} ms",
-        status.seconds,
-        vector("command", status.command),
-        vector("is", status.velocity),
-        status.falls,
-        1e3 * status.step_time,
-        1e3 * status.lateness
-    )
 }
 
 /// Returns the summary for people.
@@ -381,10 +208,4 @@ fn summary_text(summary: &RunSummary) -> String {
     lines.push(format!("lateness        {:.2} ms, at most {:.2} ms", lateness.mean_ms, lateness.max_ms));
     lines.push(format!("clipped actions {:.2} %", 100.0 * summary.clipped_share));
     lines.join("\n") + "\n"
-}
-
-fn read_commands(path: &Path) -> Result<CommandSequence, Failure> {
-    let wrong = |cause: String| Failure::Input(miette::miette!("`--commands` = {}: {cause}", path.display()));
-    let text = std::fs::read_to_string(path).map_err(|error| wrong(error.to_string()))?;
-    CommandSequence::parse(&text).map_err(|error| wrong(error.to_string()))
 }

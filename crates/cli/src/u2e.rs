@@ -1,11 +1,10 @@
 //! `twinstep u2e`: collect, fit, train an exploration policy, collect, fit, …, as one resumable command.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-use crate::exit::{CommandResult, Failure, Signals, other};
-use crate::u2e_config::{Method, Stop, U2eConfig, has_converged};
-use crate::u2e_evaluation::{Collection, Evaluation};
-use crate::{fit, stages, train, u2e_report};
+use twinstep_workflows::{Observer, u2e};
+
+use crate::exit::CommandResult;
 
 /// Learn the actuators of a robot with uncertainty-guided exploration (U2E).
 ///
@@ -61,128 +60,7 @@ pub struct Args {
 
 /// Runs the stages that are not complete.
 pub fn run(args: &Args) -> CommandResult {
-    let signals = Signals::listen()?;
-    let config = U2eConfig::load(&args.config)?;
-    let out = stages::folder_of(&args.config)?;
-    stages::keep_inputs(&out, config.inputs()?)?;
-    stages::ended(iterations(&config, &out, &signals))
-}
-
-fn iterations(config: &U2eConfig, out: &Path, signals: &Signals) -> CommandResult {
-    let mut stages: Vec<Stage> = Vec::new();
-    let mut evaluations: Vec<Evaluation> = Vec::new();
-    for iteration in 0..=config.iterations {
-        let stage = Stage::new(config, out, iteration)?;
-        eprintln!("\n{}: policy, log, ensemble", stage.folder.display());
-        let policy = stage.policy(config, stages.last(), signals)?;
-        stage.commands(config, signals)?;
-        let collection = stage.collect(config, &policy, signals)?;
-        stages.push(stage);
-        evaluations.push(fit_and_evaluate(config, &stages, collection, signals)?);
-        let uncertainties: Vec<f64> = evaluations.iter().filter_map(|evaluation| evaluation.uncertainty).collect();
-        let ends = config.stop == Stop::Uncertainty && has_converged(&uncertainties, config.threshold);
-        let robot = config.simulated_robot(Path::new(&stages[iteration].name).join("ensemble.safetensors"))?;
-        stages::write(&out.join("robot.toml"), robot.as_bytes())?;
-        let report = u2e_report::write(config, out, &evaluations, ends)?;
-        if ends || iteration == config.iterations {
-            print!("{report}");
-        }
-        if ends {
-            break;
-        }
-    }
-    println!("\nwritten to {}", out.join("report.md").display());
+    print!("{}", u2e(&args.config, &Observer::terminal()?)?);
+    println!("\nwritten to {}", args.config.with_extension("").join("report.md").display());
     Ok(())
-}
-
-/// Fits the ensemble of the last stage to all logs and evaluates it, unless both are complete.
-fn fit_and_evaluate(
-    config: &U2eConfig,
-    stages: &[Stage],
-    collection: Collection,
-    signals: &Signals,
-) -> Result<Evaluation, Failure> {
-    let (stage, earlier) = stages.split_last().expect("a stage was added");
-    let path = stage.folder.join("evaluation.json");
-    if path.exists() && stage.ensemble().exists() {
-        return stages::read_json(&path);
-    }
-    let logs: Vec<PathBuf> = stages.iter().map(Stage::log).collect();
-    if !stage.ensemble().exists() {
-        let partial = stage.folder.join("ensemble.partial.safetensors");
-        fit::write_ensemble(&config.fitting(logs.clone(), earlier.last().map(Stage::ensemble), &partial), signals)?;
-        stages::complete(&partial, &stage.ensemble())?;
-    }
-    let ensembles: Vec<PathBuf> = stages.iter().map(Stage::ensemble).collect();
-    let evaluation = Evaluation::new(&stage.name, collection, &ensembles, &logs, config.held_out.as_deref())?;
-    stages::write_json(&path, &evaluation)?;
-    Ok(evaluation)
-}
-
-/// An iteration and its files. A file exists only when it is complete.
-struct Stage {
-    iteration: usize,
-    name: String,
-    folder: PathBuf,
-}
-
-impl Stage {
-    fn new(config: &U2eConfig, out: &Path, iteration: usize) -> Result<Self, Failure> {
-        let kind = match config.method {
-            _ if iteration == 0 => "base",
-            Method::Explore => "explore",
-            Method::Random => "random",
-            Method::Base => "base",
-        };
-        let name = format!("{iteration}-{kind}");
-        let folder = out.join(&name);
-        stages::create_folder(&folder)?;
-        Ok(Self { iteration, name, folder })
-    }
-
-    fn log(&self) -> PathBuf {
-        self.folder.join("log")
-    }
-
-    fn ensemble(&self) -> PathBuf {
-        self.folder.join("ensemble.safetensors")
-    }
-
-    /// Returns the policy that collects the log. Trains it in the simulator of the `earlier` stage's ensemble, unless it is
-    /// the base policy or complete.
-    fn policy(&self, config: &U2eConfig, earlier: Option<&Self>, signals: &Signals) -> Result<PathBuf, Failure> {
-        let (Some(earlier), Method::Explore) = (earlier, config.method) else { return Ok(config.policy.clone()) };
-        let policy = self.folder.join("policy.safetensors");
-        if policy.exists() {
-            return Ok(policy);
-        }
-        let (model, settings) = (self.folder.join("simulation.toml"), self.folder.join("training.toml"));
-        let ensemble = Path::new("..").join(&earlier.name).join("ensemble.safetensors");
-        stages::write(&model, config.simulated_robot(ensemble)?.as_bytes())?;
-        stages::write(&settings, config.training(model).as_bytes())?;
-        let training = self.folder.join("training");
-        train::write_policy(&config.exploration(&settings, &training, self.iteration), signals)?;
-        let partial = self.folder.join("policy.partial.safetensors");
-        std::fs::copy(training.join("exploration.safetensors"), &partial).map_err(other)?;
-        stages::complete(&partial, &policy)?;
-        Ok(policy)
-    }
-
-    /// Writes the velocity commands, unless they are there.
-    fn commands(&self, config: &U2eConfig, signals: &Signals) -> CommandResult {
-        let (path, partial) = (self.folder.join("commands.csv"), self.folder.join("commands.partial.csv"));
-        if path.exists() {
-            return Ok(());
-        }
-        config.commands(self.iteration).write(&partial, signals)?;
-        stages::complete(&partial, &path)
-    }
-
-    /// Records the log, unless it is there. An incomplete log is never kept.
-    fn collect(&self, config: &U2eConfig, policy: &Path, signals: &Signals) -> Result<Collection, Failure> {
-        let (log, summary) = (self.log(), self.folder.join("run.json"));
-        let commands = self.folder.join("commands.csv");
-        let recording = |partial: &Path| config.recording(policy, &commands, partial, self.iteration);
-        stages::recorded((&log, &summary), config.seconds, recording, signals, Collection::new)
-    }
 }

@@ -4,8 +4,9 @@ use std::path::{Path, PathBuf};
 
 use twinstep_client::ConnectOptions;
 use twinstep_viewer::{Frame, SceneInfo, static_page, write_mcap};
+use twinstep_workflows::Observer;
 
-use crate::exit::{CommandResult, Failure, Signals, input, other};
+use crate::exit::{CommandResult, Failure, input, other};
 use crate::view_policy::WalkArgs;
 use crate::web_view::PageArgs;
 use crate::{view_endpoint, view_log, view_policy, view_tree};
@@ -78,7 +79,7 @@ struct NoTarget(String);
 
 /// Shows the target until a signal.
 pub fn run(args: &Args) -> CommandResult {
-    let signals = Signals::listen()?;
+    let observer = Observer::terminal()?;
     let path = Path::new(&args.target);
     if !path.exists() && !view_tree::is_robot(path) {
         if !view_endpoint::is_endpoint(&args.target) {
@@ -94,25 +95,25 @@ pub fn run(args: &Args) -> CommandResult {
                 args.target
             )));
         }
-        return view_endpoint::run(&options, &args.page, &signals);
+        return view_endpoint::run(&options, &args.page, &observer);
     }
     let model = args.model.as_deref();
     let is_policy = path.extension().is_some_and(|extension| extension == "safetensors" || extension == "onnx");
     if args.html.is_none() && args.mcap.is_none() {
         return if is_policy {
-            view_policy::run(path, model, &args.walk, &args.page, &signals)
+            view_policy::run(path, model, &args.walk, &args.page, &observer)
         } else if view_tree::is_robot(path) {
-            view_tree::run(path, &args.page, &signals)
+            view_tree::run(path, &args.page, &observer)
         } else {
-            view_log::run(path, model, &args.page, &signals)
+            view_log::run(path, model, &args.page, &observer)
         };
     }
     let (scene, frames) = if is_policy {
-        view_policy::motion(path, model, &args.walk, args.seconds, &signals)?
+        view_policy::motion(path, model, &args.walk, args.seconds, &observer)?
     } else if view_tree::is_robot(path) {
         view_tree::motion(path, args.seconds)?
     } else {
-        view_log::motion(path, model, args.seconds)?
+        view_log::motion(path, model, args.seconds, &observer)?
     };
     if let Some(file) = &args.html {
         write_page(file, &static_page(&scene, &frames))?;

@@ -6,7 +6,9 @@ use std::time::{Duration, Instant};
 use twinstep_client::{ConnectOptions, RobotWatch};
 use twinstep_viewer::SceneInfo;
 
-use crate::exit::{CommandResult, Failure, Signals, other};
+use twinstep_workflows::Observer;
+
+use crate::exit::{CommandResult, Failure, other};
 use crate::web_view::PageArgs;
 
 /// Beginnings of Zenoh endpoints.
@@ -22,7 +24,7 @@ pub fn is_endpoint(target: &str) -> bool {
 }
 
 /// Shows the robots until a signal or the end of their server. The server draws only while a page is open.
-pub fn run(options: &ConnectOptions, page: &PageArgs, signals: &Signals) -> CommandResult {
+pub fn run(options: &ConnectOptions, page: &PageArgs, observer: &Observer) -> CommandResult {
     let watch = RobotWatch::open(options).map_err(other)?;
     let scene: SceneInfo = serde_json::from_slice(&watch.scene().map_err(other)?)
         .map_err(|error| text(&format!("the scene of `{}` is not valid: {error}", watch.robot())))?;
@@ -30,7 +32,7 @@ pub fn run(options: &ConnectOptions, page: &PageArgs, signals: &Signals) -> Comm
     let page =
         page.open(SceneInfo { title, is_interactive: false, is_learning: false, velocity_bounds: None, ..scene })?;
     let (mut frames, mut checked) = (None, Instant::now());
-    while !signals.check()? {
+    while !observer.check()? {
         if page.hub().pages() == 0 {
             frames = None;
         } else if frames.is_none() {

@@ -11,7 +11,9 @@ use twinstep_model::{AutoresetMode, ResetRequest, VecEnv};
 use twinstep_sim::{Engine, SimConfig};
 use twinstep_viewer::{Frame, Hub, PageRequest, Playback, RobotFrame, SceneInfo};
 
-use crate::exit::{CommandResult, Failure, Signals, input, other};
+use twinstep_workflows::Observer;
+
+use crate::exit::{CommandResult, Failure, input, other};
 use crate::serve::engine;
 use crate::velocity_input;
 use crate::web_view::PageArgs;
@@ -43,10 +45,10 @@ pub struct WalkArgs {
 }
 
 /// Simulates the robots until a signal.
-pub fn run(path: &Path, model: Option<&Path>, args: &WalkArgs, page: &PageArgs, signals: &Signals) -> CommandResult {
+pub fn run(path: &Path, model: Option<&Path>, args: &WalkArgs, page: &PageArgs, observer: &Observer) -> CommandResult {
     let (mut walk, scene) = start(path, model, args)?;
     let page = page.open(scene)?;
-    walk.run(page.hub(), signals)
+    walk.run(page.hub(), observer)
 }
 
 /// Returns the first seconds.
@@ -55,11 +57,11 @@ pub fn motion(
     model: Option<&Path>,
     args: &WalkArgs,
     seconds: f64,
-    signals: &Signals,
+    observer: &Observer,
 ) -> Result<(SceneInfo, Vec<Frame>), Failure> {
     let (mut walk, scene) = start(path, model, args)?;
     let mut frames = vec![walk.frame()?];
-    while frames.last().is_some_and(|frame| frame.time < seconds) && !signals.check()? {
+    while frames.last().is_some_and(|frame| frame.time < seconds) && !observer.check()? {
         for _ in 0..STEPS_PER_FRAME {
             walk.step()?;
         }
@@ -122,9 +124,9 @@ struct PolicyWalk {
 }
 
 impl PolicyWalk {
-    fn run(&mut self, hub: &Hub, signals: &Signals) -> CommandResult {
+    fn run(&mut self, hub: &Hub, observer: &Observer) -> CommandResult {
         let mut due = Instant::now();
-        while !signals.check()? {
+        while !observer.check()? {
             for request in hub.take_requests() {
                 self.obey(request)?;
             }

@@ -9,10 +9,12 @@ use twinstep_logs::Log;
 use twinstep_model::{BaseMount, Ground, RobotTree, Scene, TreeJointKind, TreeModel};
 use twinstep_viewer::{Frame, RobotFrame, SceneInfo};
 
-use crate::exit::{CommandResult, Failure, Signals, input};
-use crate::player::{Curves, Player};
-use crate::tree_model::of_any_tree;
+use twinstep_workflows::Observer;
+
+use crate::exit::{CommandResult, Failure, input};
 use crate::web_view::PageArgs;
+use twinstep_workflows::player::{Curves, Player};
+use twinstep_workflows::tree_model::of_any_tree;
 
 /// Time in which a joint moves from the default pose to both ends of its range and back [s].
 const SWEEP_S: f64 = 2.0;
@@ -29,10 +31,10 @@ pub fn is_robot(path: &Path) -> bool {
 }
 
 /// Shows the robot of a file until a signal.
-pub fn run(path: &Path, page: &PageArgs, signals: &Signals) -> CommandResult {
+pub fn run(path: &Path, page: &PageArgs, observer: &Observer) -> CommandResult {
     let (mut player, scene) = robot(path)?;
     let page = page.open(scene)?;
-    player.run(page.hub(), signals)
+    player.run(page.hub(), observer)
 }
 
 /// Returns the first seconds of the motion of a robot's joints.

@@ -1,0 +1,291 @@
+//! Adaptation of a policy to the robot of a log: cause, corrected model, fine-tuned policy, gain.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use twinstep_client::{ConnectOptions, RemoteVecEnv};
+use twinstep_diagnose::Diagnosis;
+use twinstep_envs::Randomisation;
+use twinstep_measures::Run;
+use twinstep_model::{AutoresetMode, VecEnv};
+use twinstep_policy::{Policy, PolicyOrigin};
+use twinstep_sim::SimConfig;
+
+use crate::comparison::Comparison;
+use crate::diagnose::{DiagnoseOptions, diagnose};
+use crate::evaluate_policy::task_of;
+use crate::failure::{Failure, input, other};
+use crate::observer::Observer;
+use crate::stages;
+use crate::task_error::{RobotError, TaskError};
+use crate::train::train;
+use crate::train_config::TrainConfig;
+use crate::train_options::TrainOptions;
+
+/// Seed of the robots on which the policies are compared. No training has it.
+const COMPARED_SEED: u64 = 2_000_000;
+
+/// Settings of [`adapt`].
+#[derive(Clone, Debug)]
+pub struct AdaptOptions {
+    /// Policy file (safetensors) of `walk`, `gait`, `track`, `jump` or `attitude`.
+    pub policy: PathBuf,
+    /// Logs of the robot.
+    pub logs: Vec<PathBuf>,
+    /// Model file of the robot that the policy was trained on. `None`: the ideal Go2.
+    pub model: Option<PathBuf>,
+    /// Zenoh endpoint of the robot. `None`: the gain is predicted, and not measured.
+    pub endpoint: Option<String>,
+    /// Environment steps of the fine-tuning.
+    pub steps: u64,
+    /// Number of simulated robots on which the policies are compared.
+    pub robots: usize,
+    /// Number of runs of a robot with each policy.
+    pub runs: usize,
+    /// Duration of a run [s].
+    pub seconds: f64,
+    /// Seed of the fine-tuning and of the runs.
+    pub seed: u64,
+    /// Folder to write.
+    pub out: PathBuf,
+}
+
+impl AdaptOptions {
+    /// Returns the options of an adaptation by 4 million steps, and without a robot.
+    pub fn new(policy: impl Into<PathBuf>, logs: Vec<PathBuf>, out: impl Into<PathBuf>) -> Self {
+        Self {
+            policy: policy.into(),
+            logs,
+            model: None,
+            endpoint: None,
+            steps: 4_000_000,
+            robots: 24,
+            runs: 2,
+            seconds: 20.0,
+            seed: 1,
+            out: out.into(),
+        }
+    }
+}
+
+/// Result of [`adapt`]: `adapt.json` in its folder.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Adapted {
+    /// Causes of the difference between model and robot, with their scopes.
+    pub causes: Vec<String>,
+    /// What the error is.
+    pub error: String,
+    /// Its unit.
+    pub unit: String,
+    /// The policies on robots of the corrected model, whose parameters are drawn from their intervals.
+    pub predicted: Comparison,
+    /// The policies on the robot at the endpoint.
+    pub found: Option<Comparison>,
+    /// True if the new policy is kept, false if the old one is.
+    pub is_adapted: bool,
+}
+
+/// Adapts a policy to the robot of a log: finds what the model lacks, fine-tunes the policy on the corrected model, predicts the
+/// gain in its task and, if there is an endpoint, measures it.
+///
+/// `policy.safetensors` in the folder is the better one of the two policies. A repeated call continues an interrupted one.
+///
+/// ```no_run
+/// use twinstep_workflows::{AdaptOptions, Observer, adapt};
+///
+/// let options = AdaptOptions::new("data/policies/walk.safetensors", vec!["log".into()], "adapted");
+/// let adapted = adapt(&options, &Observer::silent())?;
+/// println!("{:?}: {:.0} % less error", adapted.causes, 100.0 * adapted.predicted.reduction);
+/// # Ok::<(), twinstep_workflows::Failure>(())
+/// ```
+pub fn adapt(options: &AdaptOptions, observer: &Observer) -> Result<Adapted, Failure> {
+    options.check()?;
+    let (policy, header) = Policy::read(&options.policy).map_err(input)?;
+    let trained = trained_with(&policy, &header.origin, options.model.as_deref())?;
+    let compared = Compared::new(options, &trained)?;
+    let before = std::fs::read(&options.policy).map_err(other)?;
+    stages::keep_inputs(&options.out, vec![("settings.txt", options.inputs()), ("policy.safetensors", before)])?;
+    stages::ended(adapted(options, &policy, &trained, &compared, observer), observer)
+}
+
+fn adapted(
+    options: &AdaptOptions,
+    policy: &Policy,
+    trained: &TrainConfig,
+    compared: &Compared,
+    observer: &Observer,
+) -> Result<Adapted, Failure> {
+    let (causes, model) = causes(options, observer)?;
+    let tuned = fine_tuned(options, trained, &model, observer)?;
+    let (new, _) = Policy::read(&tuned).map_err(input)?;
+    let policies = [policy, &new];
+    observer.note("\npredicted: both policies on robots of the corrected model");
+    let predicted = compared.in_simulation(&model, policies, observer)?;
+    let found = match &options.endpoint {
+        Some(endpoint) => {
+            observer.note(format_args!("\nfound: both policies on the robot at {endpoint}"));
+            Some(compared.on_robot(endpoint, policies, observer)?)
+        }
+        None => None,
+    };
+    let is_adapted = found.as_ref().unwrap_or(&predicted).is_better();
+    let kept = if is_adapted { &tuned } else { &options.policy };
+    let content = std::fs::read(kept).map_err(other)?;
+    stages::write(&options.out.join("policy.safetensors"), &content)?;
+    let (error, unit) = (compared.error.name().to_owned(), compared.error.unit().to_owned());
+    let adapted = Adapted { causes, error, unit, predicted, found, is_adapted };
+    stages::write_json(&options.out.join("adapt.json"), &adapted)?;
+    Ok(adapted)
+}
+
+/// Diagnoses the logs, unless that is done. Returns the names of the causes, and the corrected model.
+fn causes(options: &AdaptOptions, observer: &Observer) -> Result<(Vec<String>, PathBuf), Failure> {
+    let folder = options.out.join("diagnosis");
+    let findings = folder.join("findings.json");
+    let diagnosis: Diagnosis = if findings.exists() {
+        stages::read_json(&findings)?
+    } else {
+        observer.note(format_args!("{}: causes, corrected model", folder.display()));
+        let diagnosis =
+            DiagnoseOptions { model: options.model.clone(), ..DiagnoseOptions::new(options.logs.clone(), &folder) };
+        let found = diagnose(&diagnosis, observer)?;
+        observer.note(&found.text);
+        found.diagnosis
+    };
+    let name = |cause: &twinstep_diagnose::Cause| format!("{}@{}", cause.effect, cause.scope);
+    Ok((diagnosis.findings.iter().map(name).collect(), folder.join("extended.toml")))
+}
+
+/// Fine-tunes the policy on the corrected model, unless that is done. Returns its file.
+fn fine_tuned(
+    options: &AdaptOptions,
+    trained: &TrainConfig,
+    model: &Path,
+    observer: &Observer,
+) -> Result<PathBuf, Failure> {
+    let tuned = options.out.join("tuned.safetensors");
+    if tuned.exists() {
+        return Ok(tuned);
+    }
+    let folder = options.out.join("training");
+    observer.note(format_args!("{}: fine-tuning on the corrected model", folder.display()));
+    let mut config = TrainConfig { model: Some(absolute(model)), ..trained.clone() };
+    config.randomise.effects = true;
+    config.train.total_steps = options.steps;
+    let training = TrainOptions::new_or_resumed(folder, config, options.seed).from(&options.policy);
+    train(&training, observer)?.complete()?;
+    let partial = options.out.join("tuned.partial.safetensors");
+    std::fs::copy(training.policy(), &partial).map_err(other)?;
+    stages::complete(&partial, &tuned)?;
+    Ok(tuned)
+}
+
+fn absolute(path: &Path) -> PathBuf {
+    path.canonicalize().unwrap_or_else(|_| path.to_owned())
+}
+
+/// Returns the settings with which a policy was trained, or the default ones of its task and networks, on the nominal model.
+fn trained_with(policy: &Policy, origin: &PolicyOrigin, model: Option<&Path>) -> Result<TrainConfig, Failure> {
+    let parsed = TrainConfig::parse(&origin.config, "the policy's config");
+    let mut config =
+        parsed.unwrap_or_else(|_| TrainConfig { task: task_of(policy, &origin.config), ..TrainConfig::default() });
+    let sizes = policy.actor.sizes();
+    config.train.actor_hidden = sizes[1..sizes.len() - 1].to_vec();
+    config.model = model.map(absolute);
+    config.check()?;
+    Ok(config)
+}
+
+/// How the policies are compared.
+struct Compared {
+    error: TaskError,
+    config: TrainConfig,
+    robots: usize,
+    runs: usize,
+    run: Run,
+}
+
+impl Compared {
+    fn new(options: &AdaptOptions, trained: &TrainConfig) -> Result<Self, Failure> {
+        let (error, task) = TaskError::of(trained)?;
+        let randomise = Randomisation { effects: true, ..Randomisation::default() };
+        let config = TrainConfig { task, randomise, sim: SimConfig::default(), ..trained.clone() };
+        let run = Run { seconds: options.seconds, seed: COMPARED_SEED + options.seed };
+        Ok(Self { error, config, robots: options.robots, runs: options.runs, run })
+    }
+
+    /// Compares the policies on robots of a model, each with its own parameters within their intervals.
+    fn in_simulation(&self, model: &Path, policies: [&Policy; 2], observer: &Observer) -> Result<Comparison, Failure> {
+        let config = TrainConfig { model: Some(absolute(model)), ..self.config.clone() };
+        let mut env = config.envs(1, 1, 1)?.remove(0);
+        let bar = observer.bar(self.robots as u64, "{bar:32} {pos}/{len} robots  ETA {eta}");
+        let mut pairs = Vec::new();
+        for robot in 0..self.robots {
+            pairs.push(self.pair(env.as_mut(), policies, 1000 * robot as u64, observer)?);
+            bar.inc(1);
+        }
+        bar.finish_and_clear();
+        Ok(Comparison::new(&pairs))
+    }
+
+    /// Compares the policies on the robot at an endpoint, run by run.
+    fn on_robot(&self, endpoint: &str, policies: [&Policy; 2], observer: &Observer) -> Result<Comparison, Failure> {
+        let options = ConnectOptions {
+            interrupted: observer.flag(),
+            autoreset: AutoresetMode::SameStep,
+            critic: true,
+            ..ConnectOptions::new(endpoint, 1)
+        };
+        let mut env = RemoteVecEnv::connect(&options).map_err(other)?;
+        let compared = self.pair(&mut env, policies, 0, observer);
+        env.close().map_err(other)?;
+        Ok(Comparison::new(&[compared?]))
+    }
+
+    /// Returns the mean error of a robot under each policy, over runs with the same commands.
+    fn pair(
+        &self,
+        env: &mut dyn VecEnv,
+        policies: [&Policy; 2],
+        first: u64,
+        observer: &Observer,
+    ) -> Result<[RobotError; 2], Failure> {
+        let mut runs = [Vec::new(), Vec::new()];
+        for index in 0..self.runs as u64 {
+            let run = Run { seed: self.run.seed + first + index, ..self.run };
+            for (policy, found) in policies.iter().zip(&mut runs) {
+                found.push(self.error.measure(policy, env, run, observer)?);
+            }
+        }
+        Ok(runs.map(|found| mean(&found)))
+    }
+}
+
+fn mean(runs: &[RobotError]) -> RobotError {
+    let errors: Vec<f64> = runs.iter().filter_map(|run| run.error).collect();
+    let error = (!errors.is_empty()).then(|| errors.iter().sum::<f64>() / errors.len() as f64);
+    RobotError { error, has_fallen: runs.iter().any(|run| run.has_fallen) }
+}
+
+impl AdaptOptions {
+    fn check(&self) -> Result<(), Failure> {
+        let within = |name: &str, value: f64, low: f64, high: f64| {
+            if (low..=high).contains(&value) {
+                return Ok(());
+            }
+            Err(Failure::Input(miette::miette!("`--{name}` = {value} is outside {low} to {high}")))
+        };
+        within("steps", self.steps as f64, 1.0, 1e12)?;
+        within("robots", self.robots as f64, 1.0, 10_000.0)?;
+        within("runs", self.runs as f64, 1.0, 1000.0)?;
+        within("seconds", self.seconds, 1.0, 3600.0)
+    }
+
+    /// Returns what the stages that are kept depend on, beside the policy.
+    fn inputs(&self) -> Vec<u8> {
+        let logs: Vec<_> = self.logs.iter().map(|log| absolute(log).display().to_string()).collect();
+        let model =
+            self.model.as_deref().map_or("the ideal go2".to_owned(), |model| absolute(model).display().to_string());
+        format!("logs {logs:?}\nmodel {model}\nsteps {}\nseed {}\n", self.steps, self.seed).into_bytes()
+    }
+}

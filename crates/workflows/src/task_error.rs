@@ -1,0 +1,123 @@
+//! Error of one robot in the task of its policy, as one number.
+
+use twinstep_envs::{ControlledRobot, JumpConfig, TaskConfig, TrackConfig};
+use twinstep_measures::{AttitudeFollowing, JUMP_S, Jumping, Measure, MeasureError, Run, Tracking, Walking, measure};
+use twinstep_model::{RobotModel, VecEnv};
+use twinstep_policy::Policy;
+
+use crate::failure::{Failure, input};
+use crate::observer::Observer;
+use crate::train_config::TrainConfig;
+
+/// What is measured of the robots of a task.
+pub enum TaskError {
+    /// Velocity error [m/s], of `walk` and `gait`.
+    Velocity(Box<ControlledRobot>),
+    /// Distance from the path [m], of `track`.
+    Path(Box<TrackConfig>),
+    /// Distance of the landing from the target [m], of `jump`.
+    Landing(Box<JumpConfig>, Box<RobotModel>),
+    /// Error of roll, pitch and height, of `attitude`.
+    Attitude,
+}
+
+/// Error of a robot.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RobotError {
+    /// Error in the unit of [`TaskError::unit`]; `None` if the robot fell before there was one.
+    pub error: Option<f64>,
+    /// True if the robot fell.
+    pub has_fallen: bool,
+}
+
+impl TaskError {
+    /// Returns what is measured in the task of these settings, and the task with which it is measured.
+    pub fn of(config: &TrainConfig) -> Result<(Self, TaskConfig), Failure> {
+        let task = config.task.with_default_settings();
+        match &config.task {
+            TaskConfig::Walk(_) | TaskConfig::Gait(_) => {
+                Ok((Self::Velocity(Box::new(config.robots(1)?.control())), task))
+            }
+            TaskConfig::Track(_) => {
+                let [circle, ..] = Tracking::tasks(true);
+                Ok((Self::Path(Box::new(circle.clone())), TaskConfig::Track(circle)))
+            }
+            TaskConfig::Jump(trained) => {
+                let mut targets = Jumping::tasks(trained);
+                let middle = targets.remove(targets.len() / 2);
+                let robot = Box::new(config.quadruped()?);
+                Ok((Self::Landing(Box::new(middle.clone()), robot), TaskConfig::Jump(middle)))
+            }
+            TaskConfig::Attitude(_) => Ok((Self::Attitude, TaskConfig::Attitude(AttitudeFollowing::task()))),
+            other => Err(Failure::Input(miette::miette!(
+                "a policy of `{}` has no task error: walk, gait, track, jump or attitude",
+                other.name()
+            ))),
+        }
+    }
+
+    /// Returns the unit of the error.
+    pub fn unit(&self) -> &'static str {
+        match self {
+            Self::Velocity(_) => "m/s",
+            Self::Path(_) | Self::Landing(..) => "m",
+            Self::Attitude => "",
+        }
+    }
+
+    /// Returns what the error is.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Self::Velocity(_) => "velocity error, RMS",
+            Self::Path(_) => "distance from the path, RMS",
+            Self::Landing(..) => "distance of the landing from the target",
+            Self::Attitude => "error of roll, pitch and height",
+        }
+    }
+
+    /// Measures one robot, the only one of `env`, under the mean action of `policy`.
+    pub fn measure(
+        &self,
+        policy: &Policy,
+        env: &mut dyn VecEnv,
+        run: Run,
+        observer: &Observer,
+    ) -> Result<RobotError, Failure> {
+        let of = |error: f64, up: f64| RobotError { error: error.is_finite().then_some(error), has_fallen: up < 1.0 };
+        Ok(match self {
+            Self::Velocity(robot) => {
+                let walking = Walking::new(env.spec(), 1, &robot.feet, &robot.torque_limits).map_err(input)?;
+                let found = measured(policy, env, walking, run, observer)?;
+                of(found.velocity_rms, found.up)
+            }
+            Self::Path(task) => {
+                let tracking = Tracking::new(env.spec(), task);
+                let found = measured(policy, env, tracking, run, observer)?;
+                of(found.position_rms, found.up)
+            }
+            Self::Landing(task, robot) => {
+                let jumping = Jumping::new(env.spec(), 1, robot, task);
+                let found = measured(policy, env, jumping, Run { seconds: JUMP_S, ..run }, observer)?;
+                of(found.mean_error, found.up)
+            }
+            Self::Attitude => {
+                let attitude = AttitudeFollowing::new(env.spec()).map_err(input)?;
+                let found = measured(policy, env, attitude, run, observer)?;
+                of(found.l_attitude, found.up)
+            }
+        })
+    }
+}
+
+fn measured<M: Measure>(
+    policy: &Policy,
+    env: &mut dyn VecEnv,
+    new: M,
+    run: Run,
+    observer: &Observer,
+) -> Result<M::Found, Failure> {
+    measure(policy, env, new, run, |_| matches!(observer.check(), Ok(false))).map_err(|error| match error {
+        MeasureError::Stopped => Failure::Interrupted,
+        _ => input(error),
+    })
+}
