@@ -213,7 +213,7 @@ const QUADRUPED: [&str; 7] = ["NUM_JOINTS", "NUM_LEGS", "PerJoint", "PerLeg", "J
 
 /// Lines of code outside tests that may name the shape of the Go2, by crate. Every other crate serves any robot. `unitree` and `robot` are the
 /// Go2's own; diagnosis, its bench and `excite` are still for quadrupeds.
-const LINES_OF_QUADRUPEDS: [(&str, usize); 24] = [
+const LINES_OF_QUADRUPEDS: [(&str, usize); 25] = [
     ("crates/model", 137),
     ("crates/dynamics", 21),
     ("crates/robot-files", 20),
@@ -237,7 +237,8 @@ const LINES_OF_QUADRUPEDS: [(&str, usize); 24] = [
     ("crates/hunt", 27),
     ("crates/excite", 5),
     ("crates/bench", 21),
-    ("crates/cli", 18),
+    ("crates/workflows", 6),
+    ("crates/cli", 11),
 ];
 
 #[test]

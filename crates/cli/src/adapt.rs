@@ -19,7 +19,8 @@ use crate::exit::{CommandResult, other};
 ///   policy.safetensors   the better one of the two policies: on the robot, or else on the model
 ///   adapt.json           causes, errors before and after: predicted and found
 ///
-/// The error is the velocity error of `walk` and `gait`, the distance from the path of `track`, the
+/// The error is the velocity error of `walk` and `gait` from 1 s
+/// after each new command, the distance from the path of `track`, the
 /// distance of the landing from the target of `jump`, and the error of the attitude of `attitude`. The
 /// same command continues after Ctrl-C. A real robot must know its velocity for a measured gain; without
 /// one, compare logs of `twinstep run`.
@@ -40,7 +41,7 @@ pub struct Args {
     #[arg(long, value_name = "ENDPOINT")]
     endpoint: Option<String>,
     /// Environment steps of the fine-tuning.
-    #[arg(long, value_name = "N", default_value_t = 4_000_000)]
+    #[arg(long, value_name = "N", default_value_t = 12_000_000)]
     steps: u64,
     /// Number of simulated robots on which the policies are compared.
     #[arg(long, value_name = "N", default_value_t = 24)]
@@ -100,14 +101,13 @@ fn text(adapted: &Adapted) -> String {
             "{name:<10} {before:>7.3} -> {after:.3} {unit}, {share:.0} % less; falls {fell_before} -> {fell_after}\n"
         )
     };
-    let mut text = format!("{causes}\n{error}:\n{}", line("predicted", predicted));
     let [low, high] = predicted.interval.map(|share| 100.0 * share);
-    text += &format!("{:<10} {low:.0} to {high:.0} % for 90 % of the robots\n", "");
-    text += &found.as_ref().map_or_else(String::new, |found| line("found", found));
+    let range = format!("{:<10} {low:.0} to {high:.0} % for 90 % of the robots\n", "");
+    let found = found.as_ref().map_or_else(String::new, |found| line("found", found));
     let kept = if *is_adapted {
         "the fine-tuned policy is kept"
     } else {
         "the policy as it was is kept: the new one is not better"
     };
-    text + kept + "\n"
+    format!("{causes}\n{error}:\n{}{range}{found}{kept}\n", line("predicted", predicted))
 }

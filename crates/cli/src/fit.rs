@@ -33,55 +33,55 @@ use crate::exit::{CommandResult, Failure};
 pub struct Args {
     /// Measured logs: data files, or folders that contain one.
     #[arg(required = true)]
-    pub logs: Vec<PathBuf>,
+    logs: Vec<PathBuf>,
     /// Number of members of the ensemble.
     #[arg(long, value_name = "N", default_value_t = TrainingOptions::default().members)]
-    pub members: usize,
+    members: usize,
     /// Number of hidden units of each member's LSTM.
     #[arg(long, value_name = "N", default_value_t = TrainingOptions::default().hidden)]
-    pub hidden: usize,
+    hidden: usize,
     /// Encoding of the joint in the input: none, as in U2E (pooled), the joint type (kind), or the joint (identity).
     #[arg(long, value_name = "WHAT", value_enum, default_value_t = JointEncodingArg::Pooled)]
-    pub joint_input: JointEncodingArg,
+    joint_input: JointEncodingArg,
     /// Input of the networks: position and velocity error, as in U2E (errors), or the torque that was asked for and the
     /// velocity (torque), which serves all gains and feed-forward torque.
     #[arg(long, value_name = "WHAT", value_enum, default_value_t = NetworkInputArg::Errors)]
-    pub input: NetworkInputArg,
+    input: NetworkInputArg,
     /// Learn only the torque that the robot of this model file lacks, for `[actuator] mode = "residual"`. Logs without
     /// torque are enough if the base is fixed.
     #[arg(long, value_name = "FILE")]
-    pub residual: Option<PathBuf>,
+    residual: Option<PathBuf>,
     /// Resample the logs to this rate, at most theirs [Hz]. The ensemble is evaluated at this rate in every simulator.
     #[arg(long, value_name = "HZ")]
-    pub rate_hz: Option<f64>,
+    rate_hz: Option<f64>,
     /// Maximum number of epochs. Most trainings end earlier, by early stopping on the validation split.
     #[arg(long, value_name = "N", default_value_t = TrainingOptions::default().epochs)]
-    pub epochs: usize,
+    epochs: usize,
     /// Seed of the initial weights and of the order of the data.
     #[arg(long, default_value_t = TrainingOptions::default().seed)]
-    pub seed: u64,
+    seed: u64,
     /// Smooth the training split with a cubic spline, as U2E does. The spline halves the amplitude at this frequency
     /// [Hz]. The validation and test splits stay as measured.
     #[arg(long, value_name = "HZ")]
-    pub smooth: Option<f64>,
+    smooth: Option<f64>,
     /// Start with the weights of this ensemble, trained on earlier data with the same settings, instead of random ones.
     #[arg(long, value_name = "FILE", conflicts_with = "cross")]
-    pub from: Option<PathBuf>,
+    from: Option<PathBuf>,
     /// Train on the best available GPU (builds with `--features gpu`). Results differ from the CPU's by rounding.
     #[arg(long)]
-    pub gpu: bool,
+    gpu: bool,
     /// Continue the interrupted training in OUT.training.
     #[arg(long)]
-    pub resume: bool,
+    resume: bool,
     /// Write a plot of the learning curves.
     #[arg(long, value_name = "FILE.svg", conflicts_with = "cross")]
-    pub plot: Option<PathBuf>,
+    plot: Option<PathBuf>,
     /// Train one ensemble per log, and evaluate each of them on every log.
     #[arg(long)]
-    pub cross: bool,
+    cross: bool,
     /// File to write (safetensors); with --cross, folder to write.
     #[arg(long, value_name = "FILE")]
-    pub out: PathBuf,
+    out: PathBuf,
 }
 
 /// [`NetworkInput`] as a value of the command line.
@@ -113,7 +113,7 @@ pub fn run(args: &Args) -> CommandResult {
         fit(&options, &observer).map(|fitted| fitted.table())
     };
     match &table {
-        Ok(table) => print!("{table}written to {}\n", args.out.display()),
+        Ok(table) => println!("{table}written to {}", args.out.display()),
         Err(Failure::Interrupted) => println!("interrupted; the same command with --resume continues"),
         Err(_) => {}
     }

@@ -100,7 +100,11 @@ fn main() -> std::process::ExitCode {
     }
     let log = match &command {
         // Their errors have the reason; Zenoh would write two lines for each attempt to connect.
-        CliCommand::List(_) | CliCommand::Run(_) | CliCommand::SpiActive(_) | CliCommand::U2e(_) => "warn,zenoh=off",
+        CliCommand::Adapt(_)
+        | CliCommand::List(_)
+        | CliCommand::Run(_)
+        | CliCommand::SpiActive(_)
+        | CliCommand::U2e(_) => "warn,zenoh=off",
         _ => "warn,zenoh::api::session=error,rustdds=off,twinstep=info",
     };
     tracing_subscriber::fmt()

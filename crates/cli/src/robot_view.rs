@@ -9,7 +9,8 @@ use twinstep_robot::{Board, RobotHandle};
 use twinstep_viewer::{Frame, Hub, RobotFrame, SceneInfo};
 
 use crate::exit::{Failure, other};
-use crate::web_view::{Page, ViewArgs};
+use crate::web_view::ViewArgs;
+use twinstep_workflows::web_page::Page;
 
 /// Time between two looks at the robot.
 const PERIOD: Duration = Duration::from_millis(10);

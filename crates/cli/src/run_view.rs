@@ -10,7 +10,8 @@ use twinstep_viewer::{Frame, Hub, RobotFrame, SceneInfo};
 
 use crate::exit::Failure;
 use crate::velocity_input;
-use crate::web_view::{Page, ViewArgs};
+use crate::web_view::ViewArgs;
+use twinstep_workflows::web_page::Page;
 
 /// Time without a request of the page after which the robot is to stand. The page sends its velocity every 0.5 s.
 const PAGE_IS_GONE: Duration = Duration::from_secs(2);

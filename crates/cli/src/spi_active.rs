@@ -49,9 +49,6 @@ pub struct Args {
     config: PathBuf,
 }
 
-/// Seed of the held-out commands minus that of the config.
-const HELD_OUT_SEED: u64 = 1_000_000;
-
 /// Runs the stages that are not complete.
 pub fn run(args: &Args) -> CommandResult {
     print!("{}", spi_active(&args.config, &Observer::terminal()?)?);

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_diagnose::Diagnosis;
 use twinstep_envs::Randomisation;
-use twinstep_measures::Run;
+use twinstep_measures::{Run, check_spec};
 use twinstep_model::{AutoresetMode, VecEnv};
 use twinstep_policy::{Policy, PolicyOrigin};
 use twinstep_sim::SimConfig;
@@ -51,14 +51,14 @@ pub struct AdaptOptions {
 }
 
 impl AdaptOptions {
-    /// Returns the options of an adaptation by 4 million steps, and without a robot.
+    /// Returns the options of an adaptation by 12 million steps, and without a robot.
     pub fn new(policy: impl Into<PathBuf>, logs: Vec<PathBuf>, out: impl Into<PathBuf>) -> Self {
         Self {
             policy: policy.into(),
             logs,
             model: None,
             endpoint: None,
-            steps: 4_000_000,
+            steps: 12_000_000,
             robots: 24,
             runs: 2,
             seconds: 20.0,
@@ -103,6 +103,10 @@ pub fn adapt(options: &AdaptOptions, observer: &Observer) -> Result<Adapted, Fai
     let (policy, header) = Policy::read(&options.policy).map_err(input)?;
     let trained = trained_with(&policy, &header.origin, options.model.as_deref())?;
     let compared = Compared::new(options, &trained)?;
+    if let Some(endpoint) = &options.endpoint {
+        // Before minutes of training, not after them.
+        check_spec(&policy, compared.connect(endpoint, observer)?.spec()).map_err(input)?;
+    }
     let before = std::fs::read(&options.policy).map_err(other)?;
     stages::keep_inputs(&options.out, vec![("settings.txt", options.inputs()), ("policy.safetensors", before)])?;
     stages::ended(adapted(options, &policy, &trained, &compared, observer), observer)
@@ -230,16 +234,24 @@ impl Compared {
 
     /// Compares the policies on the robot at an endpoint, run by run.
     fn on_robot(&self, endpoint: &str, policies: [&Policy; 2], observer: &Observer) -> Result<Comparison, Failure> {
+        let mut env = self.connect(endpoint, observer)?;
+        let compared = self.pair(&mut env, policies, 0, observer);
+        env.close().map_err(other)?;
+        Ok(Comparison::new(&[compared?]))
+    }
+
+    /// Connects to the robot at an endpoint. Fails if it does not observe what the error needs.
+    fn connect(&self, endpoint: &str, observer: &Observer) -> Result<RemoteVecEnv, Failure> {
         let options = ConnectOptions {
             interrupted: observer.flag(),
             autoreset: AutoresetMode::SameStep,
             critic: true,
             ..ConnectOptions::new(endpoint, 1)
         };
-        let mut env = RemoteVecEnv::connect(&options).map_err(other)?;
-        let compared = self.pair(&mut env, policies, 0, observer);
-        env.close().map_err(other)?;
-        Ok(Comparison::new(&[compared?]))
+        let env =
+            RemoteVecEnv::connect(&options).map_err(|error| observer.check().err().unwrap_or_else(|| other(error)))?;
+        self.error.check(env.spec())?;
+        Ok(env)
     }
 
     /// Returns the mean error of a robot under each policy, over runs with the same commands.

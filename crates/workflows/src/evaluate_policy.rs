@@ -214,7 +214,7 @@ fn mapped<T, U>(rows: Vec<Row<T>>, of: impl Fn(T) -> U) -> Vec<Row<U>> {
     rows.into_iter().map(|Row { condition, engine, found }| Row { condition, engine, found: of(found) }).collect()
 }
 
-type Who<'a> = (&'a Args, &'a Policy, &'a Signals);
+type Who<'a> = (&'a EvaluatePolicyOptions, &'a Policy, &'a Observer);
 
 fn run_of(options: &EvaluatePolicyOptions) -> Run {
     Run { seconds: options.seconds, seed: options.seed }

@@ -4,7 +4,8 @@ use std::time::{Duration, Instant};
 
 use twinstep_viewer::{Frame, Hub, PageRequest, Playback, RobotFrame};
 
-use crate::failure::{CommandResult, Signals};
+use crate::failure::Failure;
+use crate::observer::Observer;
 
 /// Time between two looks at the requests.
 const TICK: Duration = Duration::from_millis(10);

@@ -22,6 +22,7 @@ pub fn robot_model(path: Option<&Path>) -> Result<RobotModel, Failure> {
 
 /// A robot and the simulator of its logs.
 pub struct SimulatedRobot {
+    /// The robot.
     pub robot: RobotModel,
     /// Contains the actuator network of the model file, if there is one.
     pub simulator: BatchRollout,

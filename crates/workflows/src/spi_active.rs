@@ -10,6 +10,9 @@ use crate::spi_active_config::{Method, SpiActiveConfig};
 use crate::spi_active_report::{self, RobotTime, StageResult};
 use crate::stages;
 
+/// Seed of the held-out commands minus that of the config.
+const HELD_OUT_SEED: u64 = 1_000_000;
+
 /// Runs the two stages of SPI-Active with the settings of a config file, as far as they are not complete. Returns the report.
 ///
 /// ```no_run

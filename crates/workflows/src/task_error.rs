@@ -2,7 +2,7 @@
 
 use twinstep_envs::{ControlledRobot, JumpConfig, TaskConfig, TrackConfig};
 use twinstep_measures::{AttitudeFollowing, JUMP_S, Jumping, Measure, MeasureError, Run, Tracking, Walking, measure};
-use twinstep_model::{RobotModel, VecEnv};
+use twinstep_model::{EnvSpec, RobotModel, VecEnv};
 use twinstep_policy::Policy;
 
 use crate::failure::{Failure, input};
@@ -11,7 +11,7 @@ use crate::train_config::TrainConfig;
 
 /// What is measured of the robots of a task.
 pub enum TaskError {
-    /// Velocity error [m/s], of `walk` and `gait`.
+    /// Velocity error from 1 s after each new command [m/s], of `walk` and `gait`: no robot follows a step of the command at once.
     Velocity(Box<ControlledRobot>),
     /// Distance from the path [m], of `track`.
     Path(Box<TrackConfig>),
@@ -68,10 +68,19 @@ impl TaskError {
     /// Returns what the error is.
     pub fn name(&self) -> &'static str {
         match self {
-            Self::Velocity(_) => "velocity error, RMS",
+            Self::Velocity(_) => "velocity error from 1 s after each new command, RMS",
             Self::Path(_) => "distance from the path, RMS",
             Self::Landing(..) => "distance of the landing from the target",
             Self::Attitude => "error of roll, pitch and height",
+        }
+    }
+
+    /// Fails if environments of this spec do not observe what is measured.
+    pub fn check(&self, spec: &EnvSpec) -> Result<(), Failure> {
+        match self {
+            Self::Velocity(robot) => Walking::new(spec, 1, &robot.feet, &robot.torque_limits).map(drop).map_err(input),
+            Self::Attitude => AttitudeFollowing::new(spec).map(drop).map_err(input),
+            Self::Path(_) | Self::Landing(..) => Ok(()),
         }
     }
 
@@ -88,7 +97,7 @@ impl TaskError {
             Self::Velocity(robot) => {
                 let walking = Walking::new(env.spec(), 1, &robot.feet, &robot.torque_limits).map_err(input)?;
                 let found = measured(policy, env, walking, run, observer)?;
-                of(found.velocity_rms, found.up)
+                of(found.settled_velocity_rms, found.up)
             }
             Self::Path(task) => {
                 let tracking = Tracking::new(env.spec(), task);
