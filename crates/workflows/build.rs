@@ -1,4 +1,4 @@
-//! Passes the git revision of the sources to the program.
+//! Passes the git revision of the sources to the policies that it trains.
 
 use std::path::Path;
 use std::process::Command;
