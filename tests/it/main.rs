@@ -6,6 +6,7 @@
 #[global_allocator]
 static ALLOCATOR: cap::Cap<std::alloc::System> = cap::Cap::new(std::alloc::System, usize::MAX);
 
+mod adapt;
 mod any_robot;
 mod any_robot_env;
 mod any_robot_log;

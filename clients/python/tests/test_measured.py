@@ -90,3 +90,29 @@ def test_identification_returns_estimates_with_intervals(arm: tuple[Path, Path],
 def test_bad_input_has_the_message_of_the_program(tmp_path: Path) -> None:
     with pytest.raises(twinstep.InvalidOptionError, match="nothing_here"):
         twinstep.evaluate(tmp_path / "nothing_here")
+
+
+def test_adaptation_has_what_was_predicted_and_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    predicted = {"mean": [0.2, 0.1], "reduction": 0.5, "interval": [0.4, 0.6], "falls": [2, 0], "errors": []}
+    found = {
+        "causes": ["payload@base"],
+        "error": "velocity error",
+        "unit": "m/s",
+        "predicted": predicted,
+        "found": None,
+        "is_adapted": True,
+    }
+    program = tmp_path / "program"
+    program.write_text(f"#!/bin/sh\ncat <<'END'\n{json.dumps(found)}\nEND\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("TWINSTEP_SERVER", str(program))
+    adapted = twinstep.adapt("walk.safetensors", "log", out=tmp_path / "adapted")
+    assert adapted.predicted == twinstep.Comparison(0.2, 0.1, 0.5, (0.4, 0.6), (2, 0))
+    assert adapted.found is None
+    assert adapted.is_adapted
+    assert adapted.policy == tmp_path / "adapted" / "policy.safetensors"
+
+
+def test_policy_that_is_not_there_is_named_by_adapt(tmp_path: Path) -> None:
+    with pytest.raises(twinstep.InvalidOptionError, match=r"nothing\.safetensors"):
+        twinstep.adapt(tmp_path / "nothing.safetensors", "log", out=tmp_path / "adapted")

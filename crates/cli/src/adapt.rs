@@ -21,7 +21,7 @@ use crate::exit::{CommandResult, other};
 ///
 /// The error is the velocity error of `walk` and `gait` from 1 s
 /// after each new command, the distance from the path of `track`, the
-/// distance of the landing from the target of `jump`, and the error of the attitude of `attitude`. The
+/// distance of the landing from the target of `jump`, and the error of roll and pitch of `attitude`. The
 /// same command continues after Ctrl-C. A real robot must know its velocity for a measured gain; without
 /// one, compare logs of `twinstep run`.
 ///

@@ -1,6 +1,6 @@
 //! Measured log in memory.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
 
 use twinstep_model::Joint;
@@ -190,7 +190,8 @@ impl Log {
         self
     }
 
-    /// Joins logs of one robot: their segments follow each other, 10 s apart. Channels that one of them lacks are left out.
+    /// Joins logs of one robot: their segments follow each other, 10 s apart. Positions, velocities and torques of joints that
+    /// one of them lacks are left out. Other sensors have no reading where they are missing, and commands of velocity and torque are 0.
     ///
     /// Returns `None` if they have other joints, torque sensors, rates or orientations of a fixed base, or one of them no gains.
     pub fn joined(logs: &[Self]) -> Option<Self> {
@@ -208,7 +209,14 @@ impl Log {
         if !others.iter().all(|log| is_alike(&log)) {
             return None;
         }
-        joined.channels.retain(|name, _| others.iter().all(|log| log.channels.contains_key(name)));
+        let in_all = |name: &str| logs.iter().all(|log| log.channels.contains_key(name));
+        let is_needed = |name: &str| {
+            let is_of_joint = ["q_", "dq_", "tau_measured_"].iter().any(|start| name.starts_with(start));
+            is_of_joint && !is_added_command(name)
+        };
+        let names: BTreeSet<&String> = logs.iter().flat_map(|log| log.channels.keys()).collect();
+        let kept = names.into_iter().filter(|name| in_all(name) || !is_needed(name));
+        joined.channels = kept.map(|name| (name.clone(), first.cells(name))).collect();
         for joint in &first.joints {
             for (index, quantity) in ["kp", "kd"].into_iter().enumerate() {
                 let gains: Option<Vec<Vec<f64>>> = logs.iter().map(|log| log.gains(joint)[index].clone()).collect();
@@ -226,11 +234,17 @@ impl Log {
             joined.meta.segments.extend(log.meta.segments.iter().cloned());
             for (name, cells) in &mut joined.channels {
                 if !["kp_", "kd_"].iter().any(|gain| name.starts_with(gain)) {
-                    cells.extend(&log.channels[name]);
+                    cells.extend(log.cells(name));
                 }
             }
         }
         Some(joined)
+    }
+
+    /// Returns a channel. Where it is missing, commands are 0 and sensors have no reading.
+    fn cells(&self, name: &str) -> Vec<f64> {
+        let missing = if is_added_command(name) { 0.0 } else { f64::NAN };
+        self.channels.get(name).cloned().unwrap_or_else(|| vec![missing; self.rows()])
     }
 
     /// Returns all columns, in the order in which they are written.
@@ -290,6 +304,11 @@ impl ColumnCells<'_> {
     }
 }
 
+/// Returns true for the commands that a log may lack: those of velocity and torque.
+fn is_added_command(name: &str) -> bool {
+    name.starts_with("dq_cmd_") || name.starts_with("tau_ff_")
+}
+
 /// Returns the ranges of rows within which neither segment nor episode changes.
 pub(crate) fn contiguous_ranges<'a>(
     segment: &'a [u32],
@@ -339,6 +358,18 @@ mod tests {
         assert!(joined.t().windows(2).all(|pair| pair[0] < pair[1]));
         assert_eq!(joined.q_cmd("elbow"), Some([20.0, 20.0, 30.0, 30.0].as_slice()));
         assert_eq!(joined.dq("elbow"), None);
+    }
+
+    #[test]
+    fn sensor_of_one_of_two_logs_has_no_reading_in_the_other() {
+        let (mut walking, hanging) = (log(20.0, false), log(20.0, false));
+        walking.channels.insert("gyro_x".to_owned(), vec![0.5, 0.6]);
+        walking.channels.insert("tau_ff_elbow".to_owned(), vec![1.0, 2.0]);
+        let joined = Log::joined(&[hanging, walking]).expect("alike");
+        let gyro = joined.channel("gyro_x").expect("a channel");
+        assert!(gyro[..2].iter().all(|cell| cell.is_nan()));
+        assert_eq!(gyro[2..], [0.5, 0.6]);
+        assert_eq!(joined.tau_ff("elbow"), Some([0.0, 0.0, 1.0, 2.0].as_slice()));
     }
 
     #[test]

@@ -17,7 +17,7 @@ pub enum TaskError {
     Path(Box<TrackConfig>),
     /// Distance of the landing from the target [m], of `jump`.
     Landing(Box<JumpConfig>, Box<RobotModel>),
-    /// Error of roll, pitch and height, of `attitude`.
+    /// Sum of the errors of roll and pitch [rad], of `attitude`.
     Attitude,
 }
 
@@ -61,7 +61,7 @@ impl TaskError {
         match self {
             Self::Velocity(_) => "m/s",
             Self::Path(_) | Self::Landing(..) => "m",
-            Self::Attitude => "",
+            Self::Attitude => "rad",
         }
     }
 
@@ -71,7 +71,7 @@ impl TaskError {
             Self::Velocity(_) => "velocity error from 1 s after each new command, RMS",
             Self::Path(_) => "distance from the path, RMS",
             Self::Landing(..) => "distance of the landing from the target",
-            Self::Attitude => "error of roll, pitch and height",
+            Self::Attitude => "sum of the errors of roll and pitch",
         }
     }
 

@@ -11,8 +11,8 @@ use clap::Parser;
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
-use twinstep_client::ServerProcess;
 use twinstep_model::{Stream, stream};
+use twinstep_tests::process::Process;
 use twinstep_tests::resumable::{Resumable, Step, number, print_result, read, text};
 
 /// Measure the gain of `twinstep adapt`.
@@ -84,10 +84,11 @@ fn row(results: &Resumable, args: &Args, robot: u64) -> Step<Row> {
     let shown = |path: &Path| path.display().to_string();
     let (model, log, out) = (shown(&model), shown(&folder.join("log")), shown(&folder.join("adapt")));
     let policy = shown(&args.policy);
-    let server = ServerProcess::start(&["--envs", "2", "--engine", &args.engine, "--model", &model]).map_err(text)?;
+    let serve = ["serve", "--listen", "tcp/127.0.0.1:0", "--envs", "2", "--engine", &args.engine, "--model", &model];
+    let (_server, endpoint) = Process::listening(&results.twinstep, &serve.map(str::to_owned))?;
     let _ = std::fs::remove_dir_all(&log);
     let seed = (args.seed + robot).to_string();
-    let endpoint = ["--endpoint", &server.endpoint];
+    let endpoint = ["--endpoint", &endpoint];
     let record = ["--seconds", "30", "--fast", "--torque", "--log", &log, "--seed", &seed];
     results.run(&[&["run", &policy][..], &endpoint, &record].concat())?;
     let adapt = ["--json", "--out", &out, "--seed", &seed];

@@ -37,12 +37,15 @@ from .errors import (
 from .factory import EnvFactory
 from .grouped import GroupedVecEnv
 from .measured import (
+    Adaptation,
     CommandError,
+    Comparison,
     Diagnosis,
     Effect,
     Estimate,
     Identification,
     ModelErrors,
+    adapt,
     diagnose,
     evaluate,
     identify,
@@ -61,8 +64,10 @@ if TYPE_CHECKING:
     from . import sb3 as sb3
 
 __all__ = [
+    "Adaptation",
     "AmbiguousRobotError",
     "CommandError",
+    "Comparison",
     "ConnectOptions",
     "Diagnosis",
     "Effect",
@@ -99,6 +104,7 @@ __all__ = [
     "Trajectory",
     "VecEnvError",
     "VersionError",
+    "adapt",
     "check_vec_env",
     "diagnose",
     "discover",

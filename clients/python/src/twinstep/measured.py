@@ -1,4 +1,4 @@
-"""What measured logs say about a robot model: ``evaluate``, ``identify`` and ``diagnose`` as functions.
+"""What measured logs say about a robot model and a policy: ``evaluate``, ``identify``, ``diagnose`` and ``adapt``.
 
 Each runs the program ``twinstep`` in a process, as the command of the same name, and returns what it found. So a result
 in Python is that of the command line, and a long search is ended by Ctrl-C or by the end of this process.
@@ -104,6 +104,42 @@ class Diagnosis:
         return f'<iframe srcdoc="{page}" width="100%" height="700" style="border: 0"></iframe>'
 
 
+@dataclass(frozen=True)
+class Comparison:
+    """Task errors of the same robots under the policy before and after."""
+
+    before: float
+    """Mean error before, in the unit of the :class:`Adaptation`."""
+    after: float
+    """Mean error after."""
+    reduction: float
+    """Share of the mean error that is gone."""
+    interval: tuple[float, float]
+    """Interval that holds 90 % of the reductions of single robots."""
+    falls: tuple[int, int]
+    """Number of robots that fell, before and after."""
+
+
+@dataclass(frozen=True)
+class Adaptation:
+    """Result of :func:`adapt`."""
+
+    causes: tuple[str, ...]
+    """Causes of the difference between model and robot, with their scopes."""
+    error: str
+    """What the task error is."""
+    unit: str
+    """Its unit."""
+    predicted: Comparison
+    """Both policies on robots of the corrected model."""
+    found: Comparison | None
+    """Both policies on the robot at the endpoint."""
+    is_adapted: bool
+    """True if the fine-tuned policy is kept."""
+    policy: Path
+    """File of the policy that is kept."""
+
+
 def evaluate(
     log: File, *, model: File | None = None, from_s: float | None = None, until_s: float | None = None
 ) -> ModelErrors:
@@ -198,6 +234,61 @@ def diagnose(logs: File | Sequence[File], *, out: File | None = None, model: Fil
         folder=folder,
         findings=findings,
     )
+
+
+def adapt(
+    policy: File,
+    logs: File | Sequence[File],
+    *,
+    out: File,
+    endpoint: str | None = None,
+    model: File | None = None,
+    steps: int | None = None,
+) -> Adaptation:
+    """Fine-tune a policy for the robot of the logs, and predict or measure the gain in its task.
+
+    A repeated call continues an interrupted one.
+
+    Parameters
+    ----------
+    policy
+        Policy file (safetensors).
+    logs
+        One log or several.
+    out
+        Folder to write.
+    endpoint
+        Zenoh endpoint of the robot. Default: the gain is predicted only.
+    model
+        Model on which the policy was trained, as of :func:`evaluate`.
+    steps
+        Environment steps of the fine-tuning. Default: that of the command.
+
+    Raises
+    ------
+    InvalidOptionError
+        The policy, a log or the model cannot be used; the message says why.
+    """
+    options = [*_option("--endpoint", endpoint), *_option("--model", model)]
+    options += _option("--steps", None if steps is None else str(steps))
+    arguments = ["adapt", fspath(policy), *_paths(logs), "--out", fspath(out), "--json", *options]
+    found = cast("dict[str, Any]", json.loads(_run(arguments)))
+    return Adaptation(
+        causes=tuple(found["causes"]),
+        error=found["error"],
+        unit=found["unit"],
+        predicted=_comparison(found["predicted"]),
+        found=None if found["found"] is None else _comparison(found["found"]),
+        is_adapted=found["is_adapted"],
+        policy=Path(out) / "policy.safetensors",
+    )
+
+
+def _comparison(found: Mapping[str, Any]) -> Comparison:
+    before, after = found["mean"]
+    low, high = found["interval"]
+    fell_before, fell_after = found["falls"]
+    return Comparison(before, after, found["reduction"], (low, high), (fell_before, fell_after))
 
 
 def _run(arguments: list[str]) -> str:
