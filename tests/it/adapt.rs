@@ -19,35 +19,59 @@ fn walk() -> String {
     root().join("data/policies/walk.safetensors").display().to_string()
 }
 
-/// Starts a server of the hidden robot, and records a walk of it.
-fn hidden_robot(folder: &Path) -> (Process, String, String) {
-    let model = folder.join("hidden.toml");
+/// Commands of a walk: the robot stands, then it walks.
+const COMMANDS: &str = "start_s,end_s,vx,vy,wz\n0,6,0,0,0\n6,10,0.6,0.2,0.3\n10,14,-0.5,0,-0.8\n14,18,0.8,0,0\n";
+
+/// Starts a server of the hidden robot. Returns it with two logs: of the robot that hangs, and that stands and walks.
+fn hidden_robot(folder: &Path) -> (Process, String, [String; 2]) {
+    let path = |name: &str| folder.join(name).display().to_string();
+    let [model, commands, hanging, walking] = ["hidden.toml", "commands.csv", "hanging.parquet", "walking"].map(path);
     std::fs::write(&model, HIDDEN).unwrap();
+    std::fs::write(&commands, COMMANDS).unwrap();
     let program = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap().twinstep();
-    let serve = ["serve", "--listen", "tcp/127.0.0.1:0", "--envs", "2", "--model", &model.display().to_string()];
+    let serve = ["serve", "--listen", "tcp/127.0.0.1:0", "--envs", "2", "--model", &model];
     let (server, endpoint) = Process::listening(&program, &serve.map(str::to_owned)).unwrap();
-    let log = folder.join("log").display().to_string();
-    let recorded =
-        twinstep(&["run", &walk(), "--endpoint", &endpoint, "--seconds", "20", "--fast", "--torque", "--log", &log]);
-    assert!(recorded.status.success(), "{}", String::from_utf8_lossy(&recorded.stderr));
-    (server, endpoint, log)
+    let recorded = [
+        twinstep(&["play", "data/go2_air_chirp", "--base", "fixed", "--model", &model, "--out", &hanging]),
+        twinstep(&[
+            "run",
+            &walk(),
+            "--endpoint",
+            &endpoint,
+            "--commands",
+            &commands,
+            "--fast",
+            "--torque",
+            "--log",
+            &walking,
+        ]),
+    ];
+    for output in recorded {
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    }
+    (server, endpoint, [hanging, walking])
 }
 
 /// The fine-tuning is too short to gain anything: what counts is that the policy that is kept is the better one.
 #[test]
 fn cause_is_named_and_the_policy_that_is_kept_is_the_better_one_on_the_robot() {
     let folder = tempfile::tempdir().unwrap();
-    let (_server, endpoint, log) = hidden_robot(folder.path());
+    let (_server, endpoint, [hanging, walking]) = hidden_robot(folder.path());
     let out = folder.path().join("adapted");
     let (policy, out_text) = (walk(), out.display().to_string());
     let short = ["--steps", "50000", "--robots", "3", "--runs", "1", "--seconds", "5", "--json"];
     let adapt = |more: &[&str]| {
-        twinstep(&[&["adapt", &policy, &log, "--endpoint", &endpoint, "--out", &out_text][..], &short, more].concat())
+        twinstep(
+            &[&["adapt", &policy, &hanging, &walking, "--endpoint", &endpoint, "--out", &out_text][..], &short, more]
+                .concat(),
+        )
     };
     let first = adapt(&[]);
     assert!(first.status.success(), "{}", String::from_utf8_lossy(&first.stderr));
     let adapted: Value = serde_json::from_slice(&first.stdout).unwrap();
-    assert!(adapted["causes"].as_array().unwrap().contains(&"viscous_friction@all".into()), "{adapted}");
+    for cause in ["viscous_friction@all", "command_delay@all"] {
+        assert!(adapted["causes"].as_array().unwrap().contains(&cause.into()), "{adapted}");
+    }
     let [before, after] = [0, 1].map(|policy| adapted["found"]["mean"][policy].as_f64().unwrap());
     let kept = std::fs::read(out.join("policy.safetensors")).unwrap();
     let expected = if adapted["is_adapted"] == true { out.join("tuned.safetensors") } else { policy.clone().into() };

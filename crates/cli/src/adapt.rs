@@ -46,7 +46,7 @@ pub struct Args {
     /// Number of simulated robots on which the policies are compared.
     #[arg(long, value_name = "N", default_value_t = 24)]
     robots: usize,
-    /// Number of runs of a robot with each policy.
+    /// Number of runs of the robot at the endpoint with each policy.
     #[arg(long, value_name = "N", default_value_t = 2)]
     runs: usize,
     /// Duration of a run [s]. A jump takes 3 s.

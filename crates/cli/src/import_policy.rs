@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use twinstep_agent::{ImportedPolicy, import_policy};
 
 use crate::exit::{CommandResult, Failure, input};
-use crate::rehearsal::Rehearsal;
+use twinstep_workflows::rehearsal::Rehearsal;
 
 /// Make the mapping of a policy of another program from the files that its training left.
 ///

@@ -28,7 +28,6 @@ mod operator;
 mod operator_screen;
 mod play;
 mod preflight;
-mod rehearsal;
 mod robot;
 mod robot_env_factory;
 mod robot_view;

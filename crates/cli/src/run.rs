@@ -107,7 +107,7 @@ pub fn run(args: &Args) -> CommandResult {
     // Read and checked before anything moves.
     args.view.check()?;
     let options = args.options()?;
-    let open = |env: &mut RemoteVecEnv| args.driver(env, options.velocity.clone());
+    let open = |env: &mut RemoteVecEnv| args.driver(env, options.velocity.clone(), &observer);
     let Recording { robot, task, summary } = record_with(&options, open, &observer)?;
     if args.json {
         let report =
@@ -168,14 +168,15 @@ impl Args {
     }
 
     /// Opens the source of commands and the view.
-    fn driver(&self, env: &mut RemoteVecEnv, velocity: Velocity) -> Result<Driver, Failure> {
+    fn driver(&self, env: &mut RemoteVecEnv, velocity: Velocity, observer: &Observer) -> Result<Driver, Failure> {
         let person = match &self.gamepad {
             Some(device) => Some(VelocityInput::gamepad(device)?),
             None if self.keyboard => Some(VelocityInput::keyboard()?),
             None => None,
         };
         if self.view.is_wanted() && self.log.is_none() {
-            env.reset(&ResetRequest::seeded(self.seed, 1)).map_err(other)?;
+            let reset = env.reset(&ResetRequest::seeded(self.seed, 1)).map(drop);
+            reset.map_err(|error| observer.check().err().unwrap_or_else(|| other(error)))?;
         }
         let steers = person.is_none() && velocity == Velocity::Endpoint;
         let view = RunView::open(&self.view, env, steers)?;

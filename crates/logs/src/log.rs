@@ -190,8 +190,8 @@ impl Log {
         self
     }
 
-    /// Joins logs of one robot: their segments follow each other, 10 s apart. Positions, velocities and torques of joints that
-    /// one of them lacks are left out. Other sensors have no reading where they are missing, and commands of velocity and torque are 0.
+    /// Joins logs of one robot: their segments follow each other, 10 s apart. Positions, velocities, torques, temperatures and voltage that one of them
+    /// lacks are left out. Other sensors have no reading where they are missing, and commands of velocity and torque are 0.
     ///
     /// Returns `None` if they have other joints, torque sensors, rates or orientations of a fixed base, or one of them no gains.
     pub fn joined(logs: &[Self]) -> Option<Self> {
@@ -211,8 +211,9 @@ impl Log {
         }
         let in_all = |name: &str| logs.iter().all(|log| log.channels.contains_key(name));
         let is_needed = |name: &str| {
-            let is_of_joint = ["q_", "dq_", "tau_measured_"].iter().any(|start| name.starts_with(start));
-            is_of_joint && !is_added_command(name)
+            let is_filled =
+                ["q_", "dq_", "tau_measured_", "temp_", "battery_V"].iter().any(|start| name.starts_with(start));
+            is_filled && !is_added_command(name)
         };
         let names: BTreeSet<&String> = logs.iter().flat_map(|log| log.channels.keys()).collect();
         let kept = names.into_iter().filter(|name| in_all(name) || !is_needed(name));

@@ -1,8 +1,10 @@
 //! Adaptation of a policy to the robot of a log: cause, corrected model, fine-tuned policy, gain.
 
+use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_diagnose::Diagnosis;
 use twinstep_envs::Randomisation;
@@ -16,6 +18,7 @@ use crate::diagnose::{DiagnoseOptions, diagnose};
 use crate::evaluate_policy::task_of;
 use crate::failure::{Failure, input, other};
 use crate::observer::Observer;
+use crate::open_log::open_log;
 use crate::stages;
 use crate::task_error::{RobotError, TaskError};
 use crate::train::train;
@@ -38,9 +41,9 @@ pub struct AdaptOptions {
     pub endpoint: Option<String>,
     /// Environment steps of the fine-tuning.
     pub steps: u64,
-    /// Number of simulated robots on which the policies are compared.
+    /// Number of simulated robots on which the policies are compared, in one run each.
     pub robots: usize,
-    /// Number of runs of a robot with each policy.
+    /// Number of runs of the robot at the endpoint with each policy.
     pub runs: usize,
     /// Duration of a run [s].
     pub seconds: f64,
@@ -103,12 +106,14 @@ pub fn adapt(options: &AdaptOptions, observer: &Observer) -> Result<Adapted, Fai
     let (policy, header) = Policy::read(&options.policy).map_err(input)?;
     let trained = trained_with(&policy, &header.origin, options.model.as_deref())?;
     let compared = Compared::new(options, &trained)?;
+    // All of it before minutes of computing, not after them.
+    check_spec(&policy, compared.config.envs(1, 1, 1)?[0].spec()).map_err(input)?;
+    let inputs = options.inputs(observer)?;
     if let Some(endpoint) = &options.endpoint {
-        // Before minutes of training, not after them.
-        check_spec(&policy, compared.connect(endpoint, observer)?.spec()).map_err(input)?;
+        compared.check_endpoint(endpoint, &policy, observer)?;
     }
     let before = std::fs::read(&options.policy).map_err(other)?;
-    stages::keep_inputs(&options.out, vec![("settings.txt", options.inputs()), ("policy.safetensors", before)])?;
+    stages::keep_inputs(&options.out, vec![("settings.txt", inputs), ("policy.safetensors", before)])?;
     stages::ended(adapted(options, &policy, &trained, &compared, observer), observer)
 }
 
@@ -154,8 +159,16 @@ fn causes(options: &AdaptOptions, observer: &Observer) -> Result<(Vec<String>, P
             DiagnoseOptions { model: options.model.clone(), ..DiagnoseOptions::new(options.logs.clone(), &folder) };
         let found = diagnose(&diagnosis, observer)?;
         observer.note(&found.text);
+        // Those of another model must not be mistaken for the results of this one.
+        stages::discard(&options.out.join("training"))?;
+        stages::discard(&options.out.join("tuned.safetensors"))?;
         found.diagnosis
     };
+    if diagnosis.extended_model.is_empty() {
+        return Err(Failure::Input(miette::miette!(
+            "the diagnosis has no corrected model\n  name the model of the robot with --model"
+        )));
+    }
     let name = |cause: &twinstep_diagnose::Cause| format!("{}@{}", cause.effect, cause.scope);
     Ok((diagnosis.findings.iter().map(name).collect(), folder.join("extended.toml")))
 }
@@ -184,8 +197,10 @@ fn fine_tuned(
     Ok(tuned)
 }
 
+/// Returns a path that is valid in every folder; the name of a robot of this program stays.
 fn absolute(path: &Path) -> PathBuf {
-    path.canonicalize().unwrap_or_else(|_| path.to_owned())
+    let file = path.canonicalize().ok().filter(|path| path.is_file());
+    file.unwrap_or_else(|| path.to_owned())
 }
 
 /// Returns the settings with which a policy was trained, or the default ones of its task and networks, on the nominal model.
@@ -224,53 +239,63 @@ impl Compared {
         let mut env = config.envs(1, 1, 1)?.remove(0);
         let bar = observer.bar(self.robots as u64, "{bar:32} {pos}/{len} robots  ETA {eta}");
         let mut pairs = Vec::new();
-        for robot in 0..self.robots {
-            pairs.push(self.pair(env.as_mut(), policies, 1000 * robot as u64, observer)?);
+        for robot in 0..self.robots as u64 {
+            pairs.push(self.pair(env.as_mut(), policies, robot, observer)?);
             bar.inc(1);
         }
         bar.finish_and_clear();
-        Ok(Comparison::new(&pairs))
+        compared(&pairs)
     }
 
     /// Compares the policies on the robot at an endpoint, run by run.
     fn on_robot(&self, endpoint: &str, policies: [&Policy; 2], observer: &Observer) -> Result<Comparison, Failure> {
-        let mut env = self.connect(endpoint, observer)?;
-        let compared = self.pair(&mut env, policies, 0, observer);
-        env.close().map_err(other)?;
-        Ok(Comparison::new(&[compared?]))
+        let mut env = connect(endpoint, observer)?;
+        let runs = (0..self.runs as u64).map(|run| self.pair(&mut env, policies, run, observer));
+        let runs = runs.collect::<Result<Vec<_>, _>>();
+        // What ended the runs matters, not what ends the connection.
+        let _ = env.close();
+        let runs = runs?;
+        compared(&[[0, 1].map(|policy| mean(&runs.iter().map(|pair| pair[policy]).collect::<Vec<_>>()))])
     }
 
-    /// Connects to the robot at an endpoint. Fails if it does not observe what the error needs.
-    fn connect(&self, endpoint: &str, observer: &Observer) -> Result<RemoteVecEnv, Failure> {
-        let options = ConnectOptions {
-            interrupted: observer.flag(),
-            autoreset: AutoresetMode::SameStep,
-            critic: true,
-            ..ConnectOptions::new(endpoint, 1)
-        };
-        let env =
-            RemoteVecEnv::connect(&options).map_err(|error| observer.check().err().unwrap_or_else(|| other(error)))?;
-        self.error.check(env.spec())?;
-        Ok(env)
+    /// Fails if the robot at an endpoint is not one of the policy, or does not observe what the error needs.
+    fn check_endpoint(&self, endpoint: &str, policy: &Policy, observer: &Observer) -> Result<(), Failure> {
+        let env = connect(endpoint, observer)?;
+        let checked = check_spec(policy, env.spec()).map_err(input).and_then(|()| self.error.check(env.spec()));
+        // Otherwise the robot is taken until the grace period has passed.
+        let closed = env.close().map_err(other);
+        checked.and(closed)
     }
 
-    /// Returns the mean error of a robot under each policy, over runs with the same commands.
+    /// Returns the error of a robot under each policy, with the same commands.
     fn pair(
         &self,
         env: &mut dyn VecEnv,
         policies: [&Policy; 2],
-        first: u64,
+        index: u64,
         observer: &Observer,
     ) -> Result<[RobotError; 2], Failure> {
-        let mut runs = [Vec::new(), Vec::new()];
-        for index in 0..self.runs as u64 {
-            let run = Run { seed: self.run.seed + first + index, ..self.run };
-            for (policy, found) in policies.iter().zip(&mut runs) {
-                found.push(self.error.measure(policy, env, run, observer)?);
-            }
-        }
-        Ok(runs.map(|found| mean(&found)))
+        let run = Run { seed: self.run.seed + index, ..self.run };
+        let [before, after] = policies.map(|policy| self.error.measure(policy, env, run, observer));
+        Ok([before?, after?])
     }
+}
+
+fn compared(pairs: &[[RobotError; 2]]) -> Result<Comparison, Failure> {
+    let too_short =
+        || Failure::Other(miette::miette!("no robot stays up for a second under both policies: nothing to compare"));
+    Comparison::new(pairs).ok_or_else(too_short)
+}
+
+fn connect(endpoint: &str, observer: &Observer) -> Result<RemoteVecEnv, Failure> {
+    let options = ConnectOptions {
+        interrupted: observer.flag(),
+        autoreset: AutoresetMode::SameStep,
+        max_episode_steps: Some(u32::MAX),
+        critic: true,
+        ..ConnectOptions::new(endpoint, 1)
+    };
+    RemoteVecEnv::connect(&options).map_err(|error| observer.check().err().unwrap_or_else(|| other(error)))
 }
 
 fn mean(runs: &[RobotError]) -> RobotError {
@@ -290,14 +315,21 @@ impl AdaptOptions {
         within("steps", self.steps as f64, 1.0, 1e12)?;
         within("robots", self.robots as f64, 1.0, 10_000.0)?;
         within("runs", self.runs as f64, 1.0, 1000.0)?;
-        within("seconds", self.seconds, 1.0, 3600.0)
+        within("seconds", self.seconds, 2.0, 3600.0)
     }
 
-    /// Returns what the stages that are kept depend on, beside the policy.
-    fn inputs(&self) -> Vec<u8> {
-        let logs: Vec<_> = self.logs.iter().map(|log| absolute(log).display().to_string()).collect();
-        let model =
-            self.model.as_deref().map_or("the ideal go2".to_owned(), |model| absolute(model).display().to_string());
-        format!("logs {logs:?}\nmodel {model}\nsteps {}\nseed {}\n", self.steps, self.seed).into_bytes()
+    /// Returns what the stages that are kept depend on, beside the policy. Fails if a log cannot be used.
+    fn inputs(&self, observer: &Observer) -> Result<Vec<u8>, Failure> {
+        let mut text = format!("steps {}\nseed {}\n", self.steps, self.seed);
+        for path in &self.logs {
+            let log = open_log(path, observer)?;
+            let cells = log.t().iter().chain(log.joints().iter().filter_map(|joint| log.q(joint)).flatten());
+            let digest = cells.fold(Sha256::new(), |digest, cell| digest.chain_update(cell.to_le_bytes())).finalize();
+            let _ = writeln!(text, "log {} {:02x?}", path.display(), &digest[..8]);
+        }
+        let model = self.model.as_deref().map(|path| std::fs::read_to_string(path).unwrap_or_default());
+        let name = self.model.as_deref().map_or("the ideal go2".to_owned(), |path| path.display().to_string());
+        let _ = writeln!(text, "model {name}\n{}", model.unwrap_or_default());
+        Ok(text.into_bytes())
     }
 }

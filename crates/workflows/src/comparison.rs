@@ -7,7 +7,7 @@ use crate::task_error::RobotError;
 /// Task errors of the robots under the policy before and after, in pairs: the same robot and the same commands.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Comparison {
-    /// Error before and after of each robot that did not fall.
+    /// Error before and after of each robot that has one under both policies; what a robot did after a fall does not count.
     pub errors: Vec<[f64; 2]>,
     /// Number of robots that fell, before and after.
     pub falls: [usize; 2],
@@ -20,20 +20,23 @@ pub struct Comparison {
 }
 
 impl Comparison {
-    /// Compares the errors of robots, each under the policy before and after.
-    pub fn new(pairs: &[[RobotError; 2]]) -> Self {
+    /// Compares the errors of robots, each under the policy before and after. `None` if none has an error under both.
+    pub fn new(pairs: &[[RobotError; 2]]) -> Option<Self> {
         let both = |[before, after]: &[RobotError; 2]| Some([before.error?, after.error?]);
         let errors: Vec<[f64; 2]> = pairs.iter().filter_map(both).collect();
+        if errors.is_empty() {
+            return None;
+        }
         let falls = [0, 1].map(|policy| pairs.iter().filter(|pair| pair[policy].has_fallen).count());
-        let count = errors.len().max(1) as f64;
+        let count = errors.len() as f64;
         let mean = [0, 1].map(|policy| errors.iter().map(|pair| pair[policy]).sum::<f64>() / count);
         let mut single: Vec<f64> = errors.iter().map(|[before, after]| reduction(*before, *after)).collect();
         single.sort_by(f64::total_cmp);
         let interval = [0.05, 0.95].map(|share| quantile(&single, share));
-        Self { errors, falls, mean, reduction: reduction(mean[0], mean[1]), interval }
+        Some(Self { errors, falls, mean, reduction: reduction(mean[0], mean[1]), interval })
     }
 
-    /// Returns true if the policy after is the better one: the error is smaller, and no robot more falls.
+    /// Returns true if the policy after is the better one: fewer robots fall, or as many and the error is smaller.
     pub fn is_better(&self) -> bool {
         let [falls_before, falls_after] = self.falls;
         falls_after < falls_before || (falls_after == falls_before && self.reduction > 0.0)
@@ -62,7 +65,7 @@ mod tests {
 
     #[test]
     fn half_of_the_error_is_a_reduction_of_one_half() {
-        let found = Comparison::new(&[pair(0.2, 0.1), pair(0.4, 0.2)]);
+        let found = Comparison::new(&[pair(0.2, 0.1), pair(0.4, 0.2)]).expect("errors");
         assert!((found.reduction - 0.5).abs() < 1e-12 && found.is_better());
         assert!(found.interval.iter().all(|bound| (bound - 0.5).abs() < 1e-12));
     }
@@ -70,15 +73,21 @@ mod tests {
     #[test]
     fn policy_with_which_more_robots_fall_is_not_better() {
         let fell = RobotError { error: Some(0.01), has_fallen: true };
-        let found = Comparison::new(&[pair(0.2, 0.1), [pair(0.2, 0.1)[0], fell]]);
+        let found = Comparison::new(&[pair(0.2, 0.1), [pair(0.2, 0.1)[0], fell]]).expect("errors");
         assert_eq!(found.falls, [0, 1]);
         assert!(found.reduction > 0.0 && !found.is_better());
     }
 
     #[test]
+    fn robots_that_fall_at_once_are_no_comparison() {
+        let fell = RobotError { error: None, has_fallen: true };
+        assert_eq!(Comparison::new(&[[fell; 2]]), None);
+    }
+
+    #[test]
     fn interval_holds_the_middle_of_the_robots() {
         let pairs: Vec<_> = (0..=100).map(|index| pair(1.0, f64::from(index) / 100.0)).collect();
-        let [low, high] = Comparison::new(&pairs).interval;
+        let [low, high] = Comparison::new(&pairs).expect("errors").interval;
         assert!((low - 0.05).abs() < 1e-9 && (high - 0.95).abs() < 1e-9, "{low} {high}");
     }
 }

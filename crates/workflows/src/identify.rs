@@ -115,9 +115,10 @@ pub fn identify(options: &IdentifyOptions, observer: &Observer) -> Result<Identi
     }
     let fitted = found.model.robot_model().map_err(other)?;
     let mut fits = Vec::new();
-    for (path, log, rows) in &logs {
-        let mut error = |robot| evaluate(log, robot, &mut simulator, |row| rows[row]).map(|found| found.q_rmse_rad);
-        if let (Some(before), Some(after)) = (error(&robot).map_err(input)?, error(&fitted).map_err(input)?) {
+    // An interrupted search leaves no time for simulations.
+    for (path, log, rows) in logs.iter().filter(|_| found.checkpoint.is_none()) {
+        let mut error = |robot| evaluate(log, robot, &mut simulator, |row| rows[row]).ok()?.q_rmse_rad;
+        if let (Some(before), Some(after)) = (error(&robot), error(&fitted)) {
             fits.push(Fit { log: (*path).clone(), q_rmse_rad: [before, after] });
         }
     }

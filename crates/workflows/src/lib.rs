@@ -43,6 +43,7 @@ pub mod open_log;
 pub mod player;
 mod random_commands;
 pub mod record;
+pub mod rehearsal;
 pub mod robot_file;
 pub mod rows;
 pub mod signals;

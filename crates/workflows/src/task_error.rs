@@ -5,7 +5,7 @@ use twinstep_measures::{AttitudeFollowing, JUMP_S, Jumping, Measure, MeasureErro
 use twinstep_model::{EnvSpec, RobotModel, VecEnv};
 use twinstep_policy::Policy;
 
-use crate::failure::{Failure, input};
+use crate::failure::{Failure, input, other};
 use crate::observer::Observer;
 use crate::train_config::TrainConfig;
 
@@ -49,9 +49,9 @@ impl TaskError {
                 Ok((Self::Landing(Box::new(middle.clone()), robot), TaskConfig::Jump(middle)))
             }
             TaskConfig::Attitude(_) => Ok((Self::Attitude, TaskConfig::Attitude(AttitudeFollowing::task()))),
-            other => Err(Failure::Input(miette::miette!(
+            unknown => Err(Failure::Input(miette::miette!(
                 "a policy of `{}` has no task error: walk, gait, track, jump or attitude",
-                other.name()
+                unknown.name()
             ))),
         }
     }
@@ -80,7 +80,10 @@ impl TaskError {
         match self {
             Self::Velocity(robot) => Walking::new(spec, 1, &robot.feet, &robot.torque_limits).map(drop).map_err(input),
             Self::Attitude => AttitudeFollowing::new(spec).map(drop).map_err(input),
-            Self::Path(_) | Self::Landing(..) => Ok(()),
+            Self::Path(_) | Self::Landing(..) => Err(Failure::Input(miette::miette!(
+                "`--endpoint` is for policies of `walk`, `gait` and `attitude`: an endpoint draws the paths and targets of the \
+                 others itself\n  leave it out, and the gain is predicted"
+            ))),
         }
     }
 
@@ -97,7 +100,9 @@ impl TaskError {
             Self::Velocity(robot) => {
                 let walking = Walking::new(env.spec(), 1, &robot.feet, &robot.torque_limits).map_err(input)?;
                 let found = measured(policy, env, walking, run, observer)?;
-                of(found.settled_velocity_rms, found.up)
+                // No robot has exactly no error: there was no step a second after a command.
+                let error = Some(found.settled_velocity_rms).filter(|error| *error > 0.0);
+                of(error.unwrap_or(f64::NAN), found.up)
             }
             Self::Path(task) => {
                 let tracking = Tracking::new(env.spec(), task);
@@ -107,7 +112,7 @@ impl TaskError {
             Self::Landing(task, robot) => {
                 let jumping = Jumping::new(env.spec(), 1, robot, task);
                 let found = measured(policy, env, jumping, Run { seconds: JUMP_S, ..run }, observer)?;
-                of(found.mean_error, found.up)
+                of(found.distance, found.up)
             }
             Self::Attitude => {
                 let attitude = AttitudeFollowing::new(env.spec()).map_err(input)?;
@@ -127,6 +132,7 @@ fn measured<M: Measure>(
 ) -> Result<M::Found, Failure> {
     measure(policy, env, new, run, |_| matches!(observer.check(), Ok(false))).map_err(|error| match error {
         MeasureError::Stopped => Failure::Interrupted,
-        _ => input(error),
+        MeasureError::Env(_) => observer.check().err().unwrap_or_else(|| other(error)),
+        MeasureError::OtherSpec { .. } | MeasureError::Missing(_) => input(error),
     })
 }

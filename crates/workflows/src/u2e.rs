@@ -117,7 +117,11 @@ impl Stage {
         stages::write(&model, config.simulated_robot(ensemble)?.as_bytes())?;
         let training = self.folder.join("training");
         let seed = config.seed + self.iteration as u64;
-        let options = TrainOptions::new_or_resumed(training.clone(), config.training(model), seed);
+        let options = TrainOptions::new_or_resumed(
+            training.clone(),
+            config.training(model.canonicalize().unwrap_or(model)),
+            seed,
+        );
         train(&options, observer)?.complete()?;
         let partial = self.folder.join("policy.partial.safetensors");
         std::fs::copy(training.join("exploration.safetensors"), &partial).map_err(other)?;

@@ -1,7 +1,8 @@
 //! Gain of `twinstep adapt` on hidden robots: predicted, found on the robot, and on 64 robots like it.
 //!
 //! `target/release/adapt_table --robots 12 --seed 1 --out adapt-table` draws robots with payloads, weak motors, friction by joint type
-//! and delays. The policy walks each of them for 30 s, and is adapted from this log. What is complete is kept.
+//! and delays. The policy is adapted from two logs of each: one of 35 s in which the robot hangs and follows chirps, and one of 28 s in
+//! which it stands and walks. What is complete is kept.
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -49,6 +50,10 @@ const PAYLOAD: f64 = 0.6;
 const PAYLOAD_KG: [f64; 2] = [1.0, 5.0];
 const PAYLOAD_M: [[f64; 2]; 3] = [[-0.1, 0.1], [-0.05, 0.05], [0.05, 0.1]];
 
+/// Commands of the second log: the robot stands, then it walks [s, m/s, rad/s].
+const COMMANDS: &str =
+    "start_s,end_s,vx,vy,wz\n0,8,0,0,0\n8,13,0.6,0.2,0.3\n13,18,-0.5,0,-0.8\n18,23,0.9,0,0\n23,28,0.3,-0.4,0.6\n";
+
 /// Result of a robot.
 #[derive(Serialize, Deserialize)]
 struct Row {
@@ -82,17 +87,21 @@ fn row(results: &Resumable, args: &Args, robot: u64) -> Step<Row> {
     let model = folder.join("hidden.toml");
     std::fs::write(&model, toml).map_err(text)?;
     let shown = |path: &Path| path.display().to_string();
-    let (model, log, out) = (shown(&model), shown(&folder.join("log")), shown(&folder.join("adapt")));
+    std::fs::write(folder.join("commands.csv"), COMMANDS).map_err(text)?;
+    let [model, commands, hanging, walking, out] =
+        ["hidden.toml", "commands.csv", "hanging.parquet", "walking", "adapt"].map(|name| shown(&folder.join(name)));
     let policy = shown(&args.policy);
     let serve = ["serve", "--listen", "tcp/127.0.0.1:0", "--envs", "2", "--engine", &args.engine, "--model", &model];
     let (_server, endpoint) = Process::listening(&results.twinstep, &serve.map(str::to_owned))?;
-    let _ = std::fs::remove_dir_all(&log);
+    let _ = std::fs::remove_dir_all(&walking);
     let seed = (args.seed + robot).to_string();
     let endpoint = ["--endpoint", &endpoint];
-    let record = ["--seconds", "30", "--fast", "--torque", "--log", &log, "--seed", &seed];
+    let play = ["play", "data/go2_air_chirp", "--base", "fixed", "--engine", &args.engine, "--model", &model];
+    results.run(&[&play[..], &["--out", &hanging]].concat())?;
+    let record = ["--commands", &commands, "--fast", "--torque", "--log", &walking, "--seed", &seed];
     results.run(&[&["run", &policy][..], &endpoint, &record].concat())?;
     let adapt = ["--json", "--out", &out, "--seed", &seed];
-    let adapted = results.run(&[&["adapt", &policy, &log][..], &endpoint, &adapt].concat())?;
+    let adapted = results.run(&[&["adapt", &policy, &hanging, &walking][..], &endpoint, &adapt].concat())?;
     let adapted: Value = serde_json::from_str(&adapted).map_err(text)?;
     let evaluated = |policy: &str| {
         let like_it =

@@ -69,6 +69,37 @@ impl<R: Residuals> Search<'_, R> {
         best
     }
 
+    /// Tries the median of all sites at those that are far from it: a law that is not linear in its parameter, such as a delay, has
+    /// several best values, of which a fit finds the next one.
+    pub fn with_alike_sites(&mut self, best: Fitted<R>, place: usize) -> Fitted<R> {
+        let cause = &best.causes[place];
+        let law = &self.laws[cause.law];
+        let median = |unknown: usize| {
+            let mut values: Vec<f64> = cause.values.iter().map(|values| values[unknown]).collect();
+            values.sort_by(f64::total_cmp);
+            values[values.len() / 2]
+        };
+        let medians: Vec<f64> = (0..law.form.units.len()).map(median).collect();
+        let is_far = |values: &[f64]| {
+            let pairs = values.iter().zip(&medians).enumerate();
+            pairs.into_iter().any(|(unknown, (value, median))| (value - median).abs() > law.small_std(unknown))
+        };
+        let alike = |values: &Vec<f64>| if is_far(values) { medians.clone() } else { values.clone() };
+        let values: Vec<Vec<f64>> = cause.values.iter().map(alike).collect();
+        let is_linear = law.strengths.len() < 2;
+        if is_linear || cause.values.len() < 3 || values == cause.values {
+            return best;
+        }
+        let mut causes = best.causes.clone();
+        causes[place].values = values;
+        let other = self.fit(causes, &best.small, self.system.fit_steps(), Some(&best));
+        if !other.is_possible || other.evidence < best.evidence + LEAST_BETTER {
+            return best;
+        }
+        self.note(format!("  sites alike: {:.1} nat", other.evidence - best.evidence));
+        other
+    }
+
     /// Tries shapes between those of the screening, where it had only some of them.
     pub fn with_best_shape(&mut self, mut best: Fitted<R>, place: usize) -> Fitted<R> {
         let shapes = &self.laws[best.causes[place].law].shapes;

@@ -17,6 +17,9 @@ pub const GRAVITY: f64 = 9.81;
 const SAMPLE_S: [f64; 3] = [0.02, 0.05, 0.02];
 /// Speed below which dry friction is not determined [rad/s].
 const LEAST_SPEED: f64 = 0.05;
+/// Time after a robot was placed on the ground in which it drops, slides and settles: it does not stand, however slowly its joints
+/// move [s].
+const SETTLING_S: f64 = 1.5;
 /// Time before and after a sample in which no foot touches down or lifts off [s].
 const SETTLED_S: f64 = 0.02;
 
@@ -129,7 +132,11 @@ pub fn samples(measured: &Measurements, robot: &Robot) -> Vec<Sample> {
             let step = steps[regime as usize];
             let rows = start..start + 2 * step;
             start += step;
-            if rows.end + MARGIN >= range.end || measured.regime[rows.end] != regime {
+            let settles = measured.t[rows.start] - measured.t[range.start] < SETTLING_S;
+            if rows.end + MARGIN >= range.end
+                || measured.regime[rows.end] != regime
+                || (regime == Regime::Stand && settles)
+            {
                 continue;
             }
             if let Some(mut sample) = sample(measured, rows, regime, &weights[regime as usize]) {
@@ -223,12 +230,14 @@ fn base_motion(measured: &Measurements, rows: &Range<usize>, regime: Regime, of:
     let of_velocity = of_velocity.filter(|acceleration| acceleration.iter().all(|part| part.is_finite()));
     // The accelerometer is less noisy than a derivative, and has gravity in it. The columns have the acceleration of the other sensor,
     // whose noise is independent, or that of gravity alone.
-    let [linear_acceleration, of_columns] = if base.acceleration.is_empty() {
-        [of_velocity?, [0.0; 3]]
-    } else {
+    let felt = (!base.acceleration.is_empty()).then(|| {
         let up = into_base([0.0, 0.0, GRAVITY]);
-        let felt = [0, 1, 2].map(|index| axis(&base.acceleration, index)[0] - up[index]);
-        [felt, of_velocity.unwrap_or([0.0; 3])]
+        [0, 1, 2].map(|index| axis(&base.acceleration, index)[0] - up[index])
+    });
+    // One of several logs may lack the sensor.
+    let [linear_acceleration, of_columns] = match felt.filter(|felt| felt.iter().all(|part| part.is_finite())) {
+        Some(felt) => [felt, of_velocity.unwrap_or([0.0; 3])],
+        None => [of_velocity?, [0.0; 3]],
     };
     let angular_velocity = gyro.map(|of| of[0]);
     // Orientations are too noisy for angular accelerations, and those of the gyroscope have little noise.
@@ -252,7 +261,8 @@ impl Sample {
     ) -> bool {
         let settled = (SETTLED_S / measured.dt).round() as usize;
         let rows = self.rows.start.saturating_sub(settled)..(self.rows.end + settled).min(measured.t.len());
-        let stands = |foot: usize| match measured.contact.get(foot) {
+        let is_measured = measured.contact.iter().any(|touches| touches[rows.clone()].iter().any(Option::is_some));
+        let stands = |foot: usize| match measured.contact.get(foot).filter(|_| is_measured) {
             Some(touches) => {
                 let first = touches[rows.start]?;
                 touches[rows.clone()].iter().all(|now| *now == Some(first)).then_some(first)

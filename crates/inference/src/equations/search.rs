@@ -114,6 +114,7 @@ impl<R: Residuals> Search<'_, R> {
         let small = Arc::new(self.system.small(self.laws, &best.robot, &best.predicted));
         best = self.fit(best.causes.clone(), &small, self.system.fit_steps(), Some(&best));
         let last = best.causes.len() - 1;
+        best = self.with_alike_sites(best, last);
         best = self.with_best_scope(best, last);
         best = self.with_best_shape(best, last);
         if !best.is_possible {
