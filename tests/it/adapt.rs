@@ -7,8 +7,17 @@ use serde_json::Value;
 use twinstep_tests::process::Process;
 use twinstep_tests::python::{Programs, root};
 
-const HIDDEN: &str =
-    "robot = \"go2\"\n[[effect]]\nname = \"viscous_friction\"\nscope = \"all\"\ncoefficient_nms = 0.4\n";
+/// Friction, and a delay that is no multiple of the period of the actuators.
+const HIDDEN: &str = r#"robot = "go2"
+[[effect]]
+name = "viscous_friction"
+scope = "all"
+coefficient_nms = 0.4
+[[effect]]
+name = "command_delay"
+scope = "all"
+delay_s = 0.0135
+"#;
 
 fn twinstep(arguments: &[&str]) -> Output {
     let program = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap().twinstep();
