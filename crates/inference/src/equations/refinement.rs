@@ -70,7 +70,7 @@ impl<R: Residuals> Search<'_, R> {
     }
 
     /// Tries the median of all sites at those that are far from it: a law that is not linear in its parameter, such as a delay, has
-    /// several best values, of which a fit finds the next one.
+    /// several best values, of which a fit finds the next one. Fits of simulations are too long, and too uncertain, for a trial.
     pub fn with_alike_sites(&mut self, best: Fitted<R>, place: usize) -> Fitted<R> {
         let cause = &best.causes[place];
         let law = &self.laws[cause.law];
@@ -87,7 +87,7 @@ impl<R: Residuals> Search<'_, R> {
         let alike = |values: &Vec<f64>| if is_far(values) { medians.clone() } else { values.clone() };
         let values: Vec<Vec<f64>> = cause.values.iter().map(alike).collect();
         let is_linear = law.strengths.len() < 2;
-        if is_linear || cause.values.len() < 3 || values == cause.values {
+        if self.system.is_simulated() || is_linear || cause.values.len() < 3 || values == cause.values {
             return best;
         }
         let mut causes = best.causes.clone();
