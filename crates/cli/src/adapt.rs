@@ -19,13 +19,15 @@ use crate::exit::{CommandResult, other};
 ///   policy.safetensors   the better one of the two policies: on the robot, or else on the model
 ///   adapt.json           causes, errors before and after: predicted and found
 ///
-/// The error is the velocity error of `walk` and `gait` from 1 s
-/// after each new command, the distance from the path of `track`, the
-/// distance of the landing from the target of `jump`, and the error of roll and pitch of `attitude`. The
-/// same command continues after Ctrl-C. A real robot must know its velocity for a measured gain; without
-/// one, compare logs of `twinstep run`.
+/// The error is, by task: `walk` and `gait`, the velocity error from 1 s after each new command;
+/// `track`, the distance from the path; `jump`, the distance of the landing from the target;
+/// `attitude`, the errors of roll and pitch. Of `track` and `jump` the gain is predicted only.
 ///
-/// Example: `twinstep adapt data/policies/walk.safetensors log --endpoint tcp/127.0.0.1:7447 --out adapted`
+/// The same command continues after Ctrl-C. For a measured gain a real robot must know its velocity;
+/// where it does not, compare two logs of `twinstep run`.
+///
+/// Example: `twinstep adapt data/policies/walk.safetensors hanging walking --out adapted --endpoint
+/// tcp/127.0.0.1:7447`
 #[derive(clap::Args)]
 #[command(verbatim_doc_comment)]
 pub struct Args {
