@@ -102,14 +102,18 @@ fn cause_is_named_and_the_policy_that_is_kept_is_the_better_one_on_the_robot() {
 fn robot_that_cannot_be_reached_and_a_task_without_an_error_are_named_before_a_training() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("adapted").display().to_string();
-    let explore = root().join("data/policies/walk.onnx").display().to_string();
+    let network = root().join("data/policies/walk.onnx").display().to_string();
     let cases = [
         (
             vec!["adapt", "data/policies/walk.safetensors", "data/go2_air_chirp", "--endpoint", "tcp/127.0.0.1:1"],
             "tcp/127.0.0.1:1",
         ),
         (vec!["adapt", "data/policies/walk.safetensors", "data/go2_air_chirp", "--seconds", "0"], "`--seconds` = 0"),
-        (vec!["adapt", &explore, "data/go2_air_chirp"], "walk.onnx"),
+        (vec!["adapt", &network, "data/go2_air_chirp"], "walk.onnx"),
+        (
+            vec!["adapt", "data/policies/jump.safetensors", "data/go2_air_chirp", "--endpoint", "tcp/127.0.0.1:1"],
+            "`--endpoint` is for policies of `walk`",
+        ),
     ];
     for (arguments, named) in cases {
         let refused = twinstep(&[&arguments[..], &["--out", &out]].concat());

@@ -13,6 +13,7 @@ use twinstep_model::{AutoresetMode, VecEnv};
 use twinstep_policy::{Policy, PolicyOrigin};
 use twinstep_sim::SimConfig;
 
+use crate::checks::within;
 use crate::comparison::Comparison;
 use crate::diagnose::{DiagnoseOptions, diagnose};
 use crate::evaluate_policy::task_of;
@@ -260,6 +261,7 @@ impl Compared {
 
     /// Fails if the robot at an endpoint is not one of the policy, or does not observe what the error needs.
     fn check_endpoint(&self, endpoint: &str, policy: &Policy, observer: &Observer) -> Result<(), Failure> {
+        self.error.check_task()?;
         let env = connect(endpoint, observer)?;
         let checked = check_spec(policy, env.spec()).map_err(input).and_then(|()| self.error.check(env.spec()));
         // Otherwise the robot is taken until the grace period has passed.
@@ -306,11 +308,8 @@ fn mean(runs: &[RobotError]) -> RobotError {
 
 impl AdaptOptions {
     fn check(&self) -> Result<(), Failure> {
-        let within = |name: &str, value: f64, low: f64, high: f64| {
-            if (low..=high).contains(&value) {
-                return Ok(());
-            }
-            Err(Failure::Input(miette::miette!("`--{name}` = {value} is outside {low} to {high}")))
+        let within = |name: &str, value, low, high| {
+            within(&format!("--{name}"), value, low, high).map_err(|cause| Failure::Input(miette::miette!("{cause}")))
         };
         within("steps", self.steps as f64, 1.0, 1e12)?;
         within("robots", self.robots as f64, 1.0, 10_000.0)?;

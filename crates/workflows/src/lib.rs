@@ -18,6 +18,7 @@
 
 pub mod adapt;
 pub mod ambiguous_effects;
+mod checks;
 mod command_env;
 pub mod comparison;
 mod cross_evaluation;

@@ -1,4 +1,4 @@
-//! Who is told how far a verb is, and who may end it.
+//! Who receives the progress of a verb, and may end it.
 
 use std::fmt::Display;
 use std::sync::Arc;

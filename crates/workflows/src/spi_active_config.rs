@@ -8,6 +8,7 @@ use twinstep_excite::{Criterion, Limits};
 use twinstep_identify::{EffectAtScope, free_parameters};
 use twinstep_policy::Policy;
 
+use crate::checks::{whole_segments, within};
 use crate::design::{DEFAULT_LIMITS, DesignOptions};
 use crate::failure::{Failure, input};
 use crate::identify_options::IdentifyOptions;
@@ -156,20 +157,12 @@ impl SpiActiveConfig {
         if let Some(index) = (1..effects.len()).find(|index| effects[..*index].contains(&effects[*index])) {
             return Err(format!("`unknowns`: `{}` is named twice", self.unknowns[index]));
         }
-        let within = |name: &str, value: f64, low: f64, high: f64| {
-            let allowed = (low..=high).contains(&value);
-            if allowed { Ok(()) } else { Err(format!("`{name}` = {value} is outside {low} to {high}")) }
-        };
         within("rounds", self.rounds as f64, 0.0, 100.0)?;
         within("seconds", self.seconds, 1.0, 600.0)?;
         within("segment_s", self.segment_s, 0.1, self.seconds)?;
         within("candidates", f64::from(self.candidates), 1.0, 1e6)?;
         within("room_m", self.room_m, 0.1, 1000.0)?;
-        let segments = self.seconds / self.segment_s;
-        if (segments - segments.round()).abs() > 1e-6 {
-            let (seconds, segment_s) = (self.seconds, self.segment_s);
-            return Err(format!("`seconds` = {seconds} is not a multiple of `segment_s` = {segment_s}"));
-        }
+        whole_segments(self.seconds, self.segment_s)?;
         Ok(())
     }
 

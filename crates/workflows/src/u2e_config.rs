@@ -12,6 +12,7 @@ use twinstep_learning::PpoConfig;
 use twinstep_logs::TorqueSensor;
 use twinstep_policy::Policy;
 
+use crate::checks::{whole_segments, within};
 use crate::design::DEFAULT_LIMITS;
 use crate::failure::{Failure, input};
 use crate::fit::FitOptions;
@@ -210,21 +211,13 @@ impl U2eConfig {
     }
 
     fn check(&self) -> Result<(), String> {
-        let within = |name: &str, value: f64, low: f64, high: f64| {
-            let allowed = (low..=high).contains(&value);
-            if allowed { Ok(()) } else { Err(format!("`{name}` = {value} is outside {low} to {high}")) }
-        };
         within("iterations", self.iterations as f64, 0.0, 100.0)?;
         within("threshold", self.threshold, 0.0, 1.0)?;
         within("seconds", self.seconds, 1.0, 600.0)?;
         within("segment_s", self.segment_s, 0.1, self.seconds)?;
         within("room_m", self.room_m, 0.1, 1000.0)?;
         within("action_noise", self.action_noise, 0.0, 1.0)?;
-        let segments = self.seconds / self.segment_s;
-        if (segments - segments.round()).abs() > 1e-6 {
-            let (seconds, segment_s) = (self.seconds, self.segment_s);
-            return Err(format!("`seconds` = {seconds} is not a multiple of `segment_s` = {segment_s}"));
-        }
+        whole_segments(self.seconds, self.segment_s)?;
         let FitTable { members, hidden, epochs, smooth_hz, .. } = &self.fit;
         let fewest = if self.method == Method::Explore { 2.0 } else { 1.0 };
         within("fit.members", *members as f64, fewest, 100.0)?;

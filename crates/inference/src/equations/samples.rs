@@ -17,8 +17,10 @@ pub const GRAVITY: f64 = 9.81;
 const SAMPLE_S: [f64; 3] = [0.02, 0.05, 0.02];
 /// Speed below which dry friction is not determined [rad/s].
 const LEAST_SPEED: f64 = 0.05;
-/// Time after a robot was placed on the ground in which it drops, slides and settles: it does not stand, however slowly its joints
-/// move [s].
+/// Time after a robot was placed on the ground in which it drops and settles [s]. A Go2 that drops by 4 cm rests after 1.3 s.
+///
+/// With these rows the height of a payload came out 0.5 m too low, on a robot with dry friction. The likely reason is that the law of
+/// friction has none at rest, where it is not determined; then this is a stand-in for friction at rest as an unknown.
 const SETTLING_S: f64 = 1.5;
 /// Time before and after a sample in which no foot touches down or lifts off [s].
 const SETTLED_S: f64 = 0.02;
