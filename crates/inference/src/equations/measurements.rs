@@ -2,16 +2,16 @@
 
 use std::ops::Range;
 
+use rayon::prelude::*;
 use twinstep_logs::{Log, TorqueSensor};
 
 use super::robot::Robot;
+use super::smoother::smoothed;
 
 /// Speed of the joints above which a robot on the ground moves: root mean square over [`REGIME_S`] [rad/s].
 const MOVING_SPEED: f64 = 0.7;
 /// Time over which the speed is averaged [s].
 const REGIME_S: f64 = 0.5;
-/// Rows before and after one whose mean replaces it where noise must not be in a column.
-const SMOOTH_ROWS: usize = 3;
 /// Longest time without a row in a range [s].
 const LONGEST_GAP_S: f64 = 0.1;
 
@@ -35,7 +35,7 @@ pub struct JointRows {
     pub q: Vec<f64>,
     /// Measured velocity [rad/s].
     pub dq: Vec<f64>,
-    /// Position [rad] and velocity [rad/s] with less noise: parabolas through the rows around each.
+    /// Position [rad] and velocity [rad/s] with less noise.
     pub smooth: [Vec<f64>; 2],
     /// Measured torque, mean from the row to the next. Not a number in rows that are not used [N·m].
     pub torque: Vec<f64>,
@@ -114,9 +114,6 @@ impl Measurements {
         }
         let t = log.increasing_t();
         let ranges: Vec<Range<usize>> = log.segments().flat_map(|(_, range)| split_at_gaps(&t, range)).collect();
-        for rows in &mut joints {
-            rows.smooth = [smoothed(&rows.q, &ranges), smoothed(&rows.dq, &ranges)];
-        }
         let mut steps: Vec<f64> =
             ranges.iter().flat_map(|range| t[range.clone()].windows(2).map(|pair| pair[1] - pair[0])).collect();
         steps.sort_by(f64::total_cmp);
@@ -134,6 +131,9 @@ impl Measurements {
             if count > 0.0 && sum > 0.0 { sum / count } else { usual }
         };
         let noise = [stated("q", 1e-4), stated("dq", 0.01), stated("tau_measured", 0.05)];
+        joints
+            .par_iter_mut()
+            .for_each(|rows| rows.smooth = smoothed(&t, [&rows.q, &rows.dq], [noise[0], noise[1]], &ranges));
         let highest = log.channel("battery_V").map_or(0.0, |cells| cells.iter().copied().fold(0.0, f64::max));
         let voltage = log.channel("battery_V").filter(|_| highest > 0.0).map(filled);
         let share = |cell: f64| cell / highest;
@@ -178,27 +178,6 @@ fn filled(cells: &[f64]) -> Vec<f64> {
         last
     };
     cells.iter().map(&mut next).collect()
-}
-
-/// Returns the values of parabolas through [`SMOOTH_ROWS`] rows before and after each; near the ends of a range, the series itself.
-fn smoothed(series: &[f64], ranges: &[Range<usize>]) -> Vec<f64> {
-    let n = SMOOTH_ROWS as f64;
-    // Savitzky and Golay 1964: the weights of a parabola's value in the middle.
-    let weight = |offset: f64| {
-        3.0 * (3.0 * n * n + 3.0 * n - 1.0 - 5.0 * offset * offset)
-            / ((2.0 * n + 1.0) * (2.0 * n - 1.0) * (2.0 * n + 3.0))
-    };
-    let mut smooth = series.to_vec();
-    for range in ranges {
-        for row in range.start + SMOOTH_ROWS..range.end.saturating_sub(SMOOTH_ROWS) {
-            let near = &series[row - SMOOTH_ROWS..=row + SMOOTH_ROWS];
-            let value: f64 = near.iter().enumerate().map(|(index, value)| weight(index as f64 - n) * value).sum();
-            if value.is_finite() {
-                smooth[row] = value;
-            }
-        }
-    }
-    smooth
 }
 
 fn vectors<const N: usize>(log: &Log, names: [&str; N]) -> Option<Vec<[f64; N]>> {

@@ -2,7 +2,7 @@
 //!
 //! - [`explain`]: what explains a log; [`explanation`]: in the terms of the catalogue. The model for predictions has all that was fitted; causes
 //!   are what of it the log shows with certainty.
-//! - [`measurements`]: the channels of a log; [`robot`]: what effects change.
+//! - [`measurements`]: the channels of a log, with less noise by a [`smoother`]; [`robot`]: what effects change.
 //! - [`residuals`]: residuals of a log, and the column of any change of the robot; [`site`]: where changes act.
 //! - [`torque_residuals`]: residuals of a log with torques, without simulation, from [`system`]. [`drive`]: the torque of each drive;
 //!   [`balance`]: the balance of each joint and of the base in [`samples`] of the log, with its [`columns`]; the gyroscope.
@@ -40,6 +40,7 @@ mod screening;
 mod search;
 mod site;
 mod small_changes;
+mod smoother;
 mod system;
 #[cfg(test)]
 mod tests;
