@@ -22,23 +22,30 @@ printf 'robot = "go2"\n[[effect]]\nname = "coulomb_friction"\nscope = "FL_calf"\
 # A desktop computer may stand still for longer than a robot may wait for its states.
 printf '[safety]\nstate_timeout_ms = 150\n' >"$folder/robot.toml"
 
-# Waits for a line of `twinstep robot` that begins with $1.
+# Whatever ends the script, no robot is left running.
+trap 'kill $(jobs -p) 2>/dev/null || true' EXIT
+
+# Waits up to a minute for a line of `twinstep robot` that begins with $1. After a fault it does not come.
 await() {
     local line
-    while read -r line <&"${ROBOT[0]}"; do
+    while read -r -t 60 line <&"${ROBOT[0]}"; do
         [[ $line == "$1"* ]] && return
     done
     echo "the robot did not say \`$1\`" >&2
     return 1
 }
 
-# Types the request $1 of the operator until it is executed.
+# Types the request $1 of the operator until it is executed, up to a minute.
 request() {
-    local line=error
+    local line=error end=$((SECONDS + 60))
     until [[ $line == ok* ]]; do
+        if ((SECONDS > end)); then
+            echo "the robot did not execute \`$1\`: $line" >&2
+            return 1
+        fi
         sleep 0.1
         echo "$1" >&"${ROBOT[1]}"
-        while read -r line <&"${ROBOT[0]}" && [[ $line == state* ]]; do :; done
+        while read -r -t 60 line <&"${ROBOT[0]}" && [[ $line == state* ]]; do :; done
     done
 }
 
