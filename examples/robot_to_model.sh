@@ -27,8 +27,8 @@ trap 'kill $(jobs -p) 2>/dev/null || true' EXIT
 
 # Waits up to a minute for a line of `twinstep robot` that begins with $1. After a fault it does not come.
 await() {
-    local line
-    while read -r -t 60 line <&"${ROBOT[0]}"; do
+    local line end=$((SECONDS + 60))
+    while ((SECONDS < end)) && read -r -t 60 line <&"${ROBOT[0]}"; do
         [[ $line == "$1"* ]] && return
     done
     echo "the robot did not say \`$1\`" >&2
