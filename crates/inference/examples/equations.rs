@@ -27,7 +27,7 @@ fn main() {
                 println!("    {} {:.4?} {:.4?}", own.joint, own.values, own.intervals);
             }
         }
-        println!("  left {:.3} {:?}", found.left, found.unknown.first());
+        println!("  left {:.3} {:?}, gains {:.3?}", found.left, found.unknown.first(), found.gains);
         found.decisions.iter().for_each(|line| eprintln!("{line}"));
     }
 }

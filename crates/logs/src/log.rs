@@ -190,6 +190,15 @@ impl Log {
         self
     }
 
+    /// Returns the log with this velocity of the base in the world frame [m/s], by axis and row.
+    #[must_use]
+    pub fn with_base_velocity(mut self, velocity: [Vec<f64>; 3]) -> Self {
+        for (name, cells) in ["vel_x", "vel_y", "vel_z"].into_iter().zip(velocity) {
+            self.channels.insert(name.to_owned(), cells);
+        }
+        self
+    }
+
     /// Joins logs of one robot: their segments follow each other, 10 s apart. Positions, velocities, torques, temperatures and voltage that one of them
     /// lacks are left out. Other sensors have no reading where they are missing, and commands of velocity and torque are 0.
     ///

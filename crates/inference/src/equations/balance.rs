@@ -10,10 +10,10 @@ use twinstep_dynamics::Vec3;
 use twinstep_dynamics::tree::{TreeAcceleration, TreeMotion, TreeParameters, TreeStructure, inverse_dynamics};
 
 use super::block::Block;
-use super::drive::{link_torque, motor_torque};
 use super::measurements::{Measurements, Regime};
 use super::robot::Robot;
 use super::samples::{GRAVITY, Motion, Sample, samples, weights};
+use super::undetermined::Weighting;
 
 /// Samples, and where their residuals are in the blocks.
 pub struct Balance {
@@ -40,7 +40,13 @@ pub struct Balance {
 impl Balance {
     /// Collects the samples, and adds their blocks.
     pub fn new(measured: &Measurements, robot: &Robot, blocks: &mut Vec<Block>) -> Self {
-        let samples = samples(measured, robot);
+        let mut samples = samples(measured, robot);
+        let noise = base_noise(measured, &samples);
+        samples.par_iter_mut().filter(|sample| sample.regime == Regime::Stand).for_each(|sample| {
+            let at_rest = (0..robot.joints.len()).filter(|joint| !sample.is_free[*joint] && !sample.turns[*joint]);
+            let at_rest: Vec<(usize, f64)> = at_rest.map(|joint| (joint, robot.scale[joint])).collect();
+            sample.weighting = Some(Weighting::new(&sample.base_per_torque, &at_rest, noise));
+        });
         let joints = robot.joints.len();
         let mut balance = Self {
             samples,
@@ -63,26 +69,20 @@ impl Balance {
     }
 
     fn add_blocks(&mut self, measured: &Measurements, robot: &Robot, blocks: &mut Vec<Block>) {
-        let noise = |regime: Regime| {
-            let usual = weights(4);
-            let rows = self.samples.iter().find(|sample| sample.regime == regime).map_or(&usual, |one| &*one.weights);
-            // Torque, and a link's inertia times the acceleration: differences of the weights.
-            let padded: Vec<f64> = std::iter::once(0.0).chain(rows.iter().copied()).chain([0.0]).collect();
-            let steps = padded.windows(2).map(|pair| (pair[1] - pair[0]).powi(2)).sum::<f64>().sqrt() / measured.dt;
-            let torque = measured.noise[2] * rows.iter().map(|weight| weight * weight).sum::<f64>().sqrt();
-            let inertial = if regime == Regime::Hang { 0.03 } else { 0.05 };
-            (torque * torque + (inertial * measured.noise[1] * steps).powi(2)).sqrt()
-        };
         let mut series: Vec<Block> = Vec::new();
         for regime in [Regime::Hang, Regime::Move] {
             for joint in &robot.tree.joints {
                 let name = format!("joint {} {}", joint.name, if regime == Regime::Hang { "hang" } else { "swing" });
-                series.push(Block { name, t: Vec::new(), y: Vec::new(), sigma: noise(regime) });
+                series.push(Block {
+                    name,
+                    t: Vec::new(),
+                    y: Vec::new(),
+                    sigma: noise(measured, &self.samples, regime),
+                });
             }
         }
-        for axis in ["mx", "my", "mz", "fx", "fy", "fz"] {
-            let lever = if axis.starts_with('f') { 10.0 } else { 2.0 };
-            let sigma = lever * noise(Regime::Stand);
+        let axes = ["mx", "my", "mz", "fx", "fy", "fz"];
+        for (axis, sigma) in axes.into_iter().zip(base_noise(measured, &self.samples)) {
             series.push(Block { name: format!("base {axis} stand"), t: Vec::new(), y: Vec::new(), sigma });
         }
         let first = self.first_block;
@@ -125,7 +125,7 @@ impl Balance {
                 lacking[6 + joint] += if self.is_at_output {
                     motor
                 } else {
-                    link_torque(&robot.joints[joint], motor, sample.response.of(joint))
+                    sample.link_torque_at(robot, joint, motor, sample.response.ddq[joint])
                 };
             }
             lacking
@@ -182,7 +182,8 @@ impl Balance {
                     .enumerate()
                     .map(|(row, force)| if row < 6 { -force } else { links[row - 6] - force })
                     .collect();
-                let left = DVector::from_fn(6, |axis, _| self.projected(sample, &lacking, 2 * self.joints + axis));
+                let of_joints = DVector::from_row_slice(&lacking[6..]);
+                let left = DVector::from_row_slice(&lacking[..6]) - &per * of_joints;
                 // Two feet exert no moment about the line between them.
                 let square = &per * per.transpose();
                 let square = &square + DMatrix::identity(6, 6) * (1e-6 * square.trace() + 1e-12);
@@ -191,15 +192,9 @@ impl Balance {
                     links.iter_mut().zip(change.iter()).for_each(|(link, change)| *link += change);
                 }
             }
-            let motion = |joint: usize| sample.instrument.of(joint);
-            (0..self.joints).map(|joint| motor_torque(&robot.joints[joint], links[joint], motion(joint))).collect()
+            (0..self.joints).map(|joint| sample.motor_torque(robot, joint, links[joint])).collect()
         };
         self.samples.par_iter().enumerate().map(balanced).collect()
-    }
-
-    /// Returns true if the log has samples of a robot that stands.
-    pub fn stands(&self) -> bool {
-        self.samples.iter().any(|sample| sample.regime == Regime::Stand)
     }
 
     /// Writes the residuals of a robot, given what its motion needs and the torques of its motors in balance.
@@ -233,14 +228,37 @@ impl Balance {
         }
     }
 
+    /// Writes the residuals of a robot whose torques were not measured, given what its motion needs, and the torques of the motors by its
+    /// drives and by those of the reference, by joint and sample.
+    pub fn write_drive_residuals(
+        &self,
+        robot: &Robot,
+        needed: &[Vec<f64>],
+        [now, before]: [&[Vec<f64>]; 2],
+        blocks: &mut [Block],
+    ) {
+        for (index, sample) in self.samples.iter().enumerate() {
+            let mut all = self.first_lacking[index].clone();
+            for (force, (now, before)) in all.iter_mut().zip(needed[index].iter().zip(&self.needed[index])) {
+                *force -= now - before;
+            }
+            for joint in 0..self.joints {
+                all[6 + joint] += sample.link_torque(robot, joint, now[joint][index])
+                    - sample.link_torque(&self.reference, joint, before[joint][index]);
+            }
+            for (residual, block, row) in &self.places[index] {
+                blocks[*block].y[*row] = self.projected(sample, &all, *residual);
+            }
+        }
+    }
+
     /// Returns a residual, given moment and force at the base and the torques of the joints.
     pub fn projected(&self, sample: &Sample, forces: &[f64], residual: usize) -> f64 {
         if residual < 2 * self.joints {
             return forces[6 + residual % self.joints];
         }
         let axis = residual - 2 * self.joints;
-        let of_joints = sample.base_per_torque.iter().enumerate().map(|(joint, per)| per[axis] * forces[6 + joint]);
-        forces[axis] - of_joints.sum::<f64>()
+        sample.weighting.as_ref().map_or(0.0, |weighting| weighting.along(axis, forces, &forces[6..]))
     }
 
     /// Returns moment and force at the base, and the torque of each joint, that a motion needs.
@@ -277,4 +295,21 @@ pub fn advanced(measured: &Measurements, joint: usize, robot: &Robot, series: &[
         (1.0 - part) * series[(row + whole).min(last)] + part * series[(row + whole + 1).min(last)]
     };
     (0..series.len()).map(at).collect()
+}
+
+/// Returns the noise of the balance of a joint in a regime [N·m].
+fn noise(measured: &Measurements, samples: &[Sample], regime: Regime) -> f64 {
+    let usual = weights(4);
+    let rows = samples.iter().find(|sample| sample.regime == regime).map_or(&usual, |one| &*one.weights);
+    // Torque, and a link's inertia times the acceleration: differences of the weights.
+    let padded: Vec<f64> = std::iter::once(0.0).chain(rows.iter().copied()).chain([0.0]).collect();
+    let steps = padded.windows(2).map(|pair| (pair[1] - pair[0]).powi(2)).sum::<f64>().sqrt() / measured.dt;
+    let torque = measured.noise[2] * rows.iter().map(|weight| weight * weight).sum::<f64>().sqrt();
+    let inertial = if regime == Regime::Hang { 0.03 } else { 0.05 };
+    (torque * torque + (inertial * measured.noise[1] * steps).powi(2)).sqrt()
+}
+
+/// Returns the noise of moment [N·m] and force [N] in the balance of a base that stands.
+fn base_noise(measured: &Measurements, samples: &[Sample]) -> [f64; 6] {
+    [2.0, 2.0, 2.0, 10.0, 10.0, 10.0].map(|lever| lever * noise(measured, samples, Regime::Stand))
 }

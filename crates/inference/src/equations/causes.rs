@@ -115,8 +115,8 @@ pub struct Found {
     pub decisions: Vec<String>,
     /// Laws that the catalogue does not have, the strongest first.
     pub unknown: Vec<UnknownLaw>,
-    /// True if the gains of the joints differ, beside the causes, by more than they are uncertain.
-    pub gains_differ: bool,
+    /// Scales of position and velocity gain by joint, if they differ, beside the causes, by more than they are uncertain; else empty.
+    pub gains: Vec<[f64; 2]>,
     /// Correlation of the first unknowns of each pair of causes, by their places.
     pub correlations: Vec<(usize, usize, f64)>,
 }

@@ -19,7 +19,10 @@ impl Balance {
             match residual.checked_sub(2 * self.joints) {
                 None if residual % self.joints == joint => -change[index],
                 None => 0.0,
-                Some(axis) => sample.base_per_torque[joint][axis] * change[index],
+                Some(axis) => {
+                    let weighting = sample.weighting.as_ref();
+                    weighting.map_or(0.0, |weighting| weighting.per_torque[joint][axis] * change[index])
+                }
             }
         })
     }

@@ -49,6 +49,19 @@ pub fn sensed_torque(measured: &Measurements, rows: &JointRows, [q, dq]: [&[f64]
     sensed
 }
 
+impl Measurements {
+    /// Takes the torques of a robot's drives on smooth readings for measured ones, in the rows that are used.
+    pub fn set_torques_of_drives(&mut self, robot: &Robot) {
+        let of = |rows: &JointRows| sensed_torque(self, rows, [&rows.smooth[0], &rows.smooth[1]], robot);
+        let torques: Vec<Vec<f64>> = self.joints.iter().map(of).collect();
+        for (rows, torques) in self.joints.iter_mut().zip(torques) {
+            for (used, torque) in rows.torque.iter_mut().zip(torques).filter(|(used, _)| used.is_finite()) {
+                *used = torque;
+            }
+        }
+    }
+}
+
 fn commands(rows: &JointRows, row: usize) -> SimdCommands<[f64; 1]> {
     let [q, dq, tau_ff] = [0, 1, 2].map(|quantity| [rows.command[quantity][row]]);
     let [kp, kd] = [0, 1].map(|gain| [rows.gains[gain][row]]);
@@ -81,12 +94,12 @@ pub fn link_torque(joint: &JointModel, motor: f64, [q, dq, ddq]: [f64; 3]) -> f6
     torque - joint.viscous_friction * dq - dry * smooth_sign(dq) + spring - joint.armature * ddq
 }
 
-/// Returns the torque of the motor [N·m] that has this torque on the link, the inverse of [`link_torque`].
-pub fn motor_torque(joint: &JointModel, link: f64, motion: [f64; 3]) -> f64 {
-    let mut motor = link / joint.actuator.gain;
+/// Returns the torque of a motor [N·m] that has this torque on the link, given what each torque of the motor has, and its gain.
+pub fn inverse(gain: f64, link: f64, link_torque: impl Fn(f64) -> f64) -> f64 {
+    let mut motor = link / gain;
     // Friction that grows with the torque is small, so that few steps suffice.
     for _ in 0..4 {
-        motor += (link - link_torque(joint, motor, motion)) / joint.actuator.gain;
+        motor += (link - link_torque(motor)) / gain;
     }
     motor
 }

@@ -11,7 +11,7 @@ use twinstep_model::{Joint, RobotModel, RobotTree, TreeJoint, TreeModel};
 use super::causes::ScopeSites;
 use super::explanation::{Explained, Terms};
 use super::law::{Law, Place, laws};
-use super::measurements::{Measurements, Regime};
+use super::measurements::Measurements;
 use super::positions::{Drives, Positions, is_simulated};
 use super::problem::Search;
 use super::robot::Robot;
@@ -82,12 +82,15 @@ fn explain_robot(
     let is_of_positions = measured.is_none();
     let found = if let Some(measured) = measured {
         let system = System::new(measured, &robot);
-        let hangs = system.measured.regime.contains(&Regime::Hang);
-        let is_free = system.measured.regime.iter().any(|regime| *regime != Regime::Hang);
-        if is_free && !(hangs && system.balance.stands()) && !robot.feet.is_empty() {
-            return Err(InferenceError::NothingToSimulate);
+        let is_balanced = !system.balance.samples.is_empty();
+        if !system.measured.has_torque {
+            if !is_balanced {
+                return Err(InferenceError::NothingToSimulate);
+            }
+            for law in laws.iter_mut().filter(|law| law.form.place == Place::Sensor) {
+                law.is_cause = false;
+            }
         }
-        let is_balanced = hangs && !system.balance.samples.is_empty();
         for law in laws.iter_mut().filter(|_| !is_balanced) {
             let is_of_joint = law.form.place == Place::Joint && system.measured.is_at_output;
             law.is_cause &= matches!(law.form.place, Place::Drive | Place::Supply) || is_of_joint;

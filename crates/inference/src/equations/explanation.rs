@@ -59,8 +59,8 @@ pub struct Explained {
     pub correlations: Vec<(usize, usize, f64)>,
     /// Variance above noise that is left, relative to that of the given robot.
     pub left: f64,
-    /// True if the gains of the joints differ, beside the causes, by more than they are uncertain.
-    pub gains_differ: bool,
+    /// Scales of position and velocity gain by joint, if they differ, beside the causes, by more than they are uncertain; else empty.
+    pub gains: Vec<[f64; 2]>,
     /// Laws that the catalogue does not have, the strongest first.
     pub unknown: Vec<UnknownLaw>,
     /// True if the log has no torques, so that positions were compared.
@@ -100,7 +100,7 @@ impl Terms<'_> {
         let sum = |side: usize| found.left.iter().map(|(_, powers)| excess(powers[side])).sum::<f64>();
         Explained {
             left: if sum(0) > 0.0 { sum(1) / sum(0) } else { 0.0 },
-            gains_differ: found.gains_differ,
+            gains: found.gains,
             is_of_positions: false,
             unknown: found.unknown,
             correlations: found.correlations.into_iter().filter(is_named).collect(),

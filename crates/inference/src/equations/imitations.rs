@@ -142,7 +142,7 @@ impl<R: Residuals> Search<'_, R> {
         Self::posterior_with(fit, best, further).evidence + log_prior
     }
 
-    fn posterior_with(fit: &Fitted<R>, best: &Fitted<R>, further: Vec<Group>) -> Posterior {
+    pub fn posterior_with(fit: &Fitted<R>, best: &Fitted<R>, further: Vec<Group>) -> Posterior {
         let groups: Vec<Group> = fit.groups.iter().cloned().chain(further).collect();
         posterior(&fit.blocks, [&fit.small.groups, &groups], Some(&best.posterior.noise), &fit.small.cache)
     }

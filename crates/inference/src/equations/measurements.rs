@@ -14,6 +14,8 @@ const MOVING_SPEED: f64 = 0.7;
 const REGIME_S: f64 = 0.5;
 /// Longest time without a row in a range [s].
 const LONGEST_GAP_S: f64 = 0.1;
+/// Usual noise of a gyroscope [rad/s].
+const GYRO_NOISE: f64 = 0.02;
 
 /// What the robot does in a row.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -37,7 +39,7 @@ pub struct JointRows {
     pub dq: Vec<f64>,
     /// Position [rad] and velocity [rad/s] with less noise.
     pub smooth: [Vec<f64>; 2],
-    /// Measured torque, mean from the row to the next. Not a number in rows that are not used [N·m].
+    /// Measured torque, mean from the row to the next, zero without sensors. Not a number in rows that are not used [N·m].
     pub torque: Vec<f64>,
     /// Commanded position [rad], velocity [rad/s] and torque [N·m].
     pub command: [Vec<f64>; 3],
@@ -54,6 +56,8 @@ pub struct BaseRows {
     pub orientation: Vec<[f64; 4]>,
     /// Reading of the gyroscope [rad/s].
     pub gyro: Vec<[f64; 3]>,
+    /// The same with less noise [rad/s].
+    pub smooth_gyro: Vec<[f64; 3]>,
     /// Reading of the accelerometer [m/s²]; empty if it was not measured.
     pub acceleration: Vec<[f64; 3]>,
     /// Velocity in the world frame [m/s]; empty if it was not measured.
@@ -79,6 +83,8 @@ pub struct Measurements {
     pub contact: Vec<Vec<Option<bool>>>,
     /// Supply voltage divided by the highest of the log; empty if it was not measured.
     pub voltage_share: Vec<f64>,
+    /// True if torques were measured.
+    pub has_torque: bool,
     /// True if the torque sensors are between gear and link, false if motor currents were measured.
     pub is_at_output: bool,
     /// Standard deviation of the noise of position [rad], velocity [rad/s] and torque [N·m].
@@ -88,17 +94,19 @@ pub struct Measurements {
 impl Measurements {
     /// Collects the channels of `log`, and the torques of the rows that are used.
     ///
-    /// Returns `None` if it has no torques, velocities or gains of a joint, or the joints are not those of the robot.
+    /// Returns `None` if it has no velocities or gains of a joint, if it has no torques and the base is fixed, or if the joints are not
+    /// those of the robot.
     pub fn new(log: &Log, robot: &Robot, is_used: impl Fn(usize) -> bool) -> Option<Self> {
         let sensor = log.meta().tau_sensor;
-        if sensor == TorqueSensor::None {
+        let has_torque = sensor != TorqueSensor::None;
+        if !has_torque && log.segments().all(|(segment, _)| segment.base.is_fixed()) {
             return None;
         }
         let plain = |name: &str| name.to_lowercase().trim_end_matches("_joint").to_owned();
         let mut joints = Vec::new();
         for name in log.joints() {
             let joint = robot.tree.joints.iter().position(|joint| plain(&joint.name) == plain(name))?;
-            joints.push(joint_rows(log, name, joint)?);
+            joints.push(joint_rows(log, name, joint, has_torque)?);
         }
         joints.sort_by_key(|rows: &JointRows| rows.joint);
         for rows in &mut joints {
@@ -128,18 +136,18 @@ impl Measurements {
         let stated = |channel: &str, usual: f64| {
             let all = log.joints().iter().filter_map(|joint| log.noise(&format!("{channel}_{joint}")));
             let (sum, count) = all.fold((0.0, 0.0), |(sum, count), noise| (sum + noise, count + 1.0));
-            if count > 0.0 && sum > 0.0 { sum / count } else { usual }
+            if count > 0.0 && sum > 0.0 { (sum / count, true) } else { (usual, false) }
         };
-        let noise = [stated("q", 1e-4), stated("dq", 0.01), stated("tau_measured", 0.05)];
-        joints
-            .par_iter_mut()
-            .for_each(|rows| rows.smooth = smoothed(&t, [&rows.q, &rows.dq], [noise[0], noise[1]], &ranges));
+        let [of_q, of_dq] = [stated("q", 1e-4), stated("dq", 0.01)];
+        let noise = [of_q.0, of_dq.0, stated("tau_measured", 0.05).0];
+        joints.par_iter_mut().for_each(|rows| rows.smooth = smoothed(&t, [&rows.q, &rows.dq], [of_q, of_dq], &ranges));
         let highest = log.channel("battery_V").map_or(0.0, |cells| cells.iter().copied().fold(0.0, f64::max));
         let voltage = log.channel("battery_V").filter(|_| highest > 0.0).map(filled);
         let share = |cell: f64| cell / highest;
         Some(Self {
-            base: base_rows(log),
+            base: base_rows(log, &t, &ranges),
             contact: contact_rows(log, robot),
+            has_torque,
             is_at_output: sensor == TorqueSensor::JointOutput,
             voltage_share: voltage.map_or(Vec::new(), |cells| cells.into_iter().map(share).collect()),
             t,
@@ -152,7 +160,7 @@ impl Measurements {
     }
 }
 
-fn joint_rows(log: &Log, name: &str, joint: usize) -> Option<JointRows> {
+fn joint_rows(log: &Log, name: &str, joint: usize, has_torque: bool) -> Option<JointRows> {
     let or_zero = |cells: Option<&[f64]>| cells.map_or(vec![0.0; log.rows()], <[f64]>::to_vec);
     let [kp, kd] = log.gains(name);
     Some(JointRows {
@@ -160,7 +168,7 @@ fn joint_rows(log: &Log, name: &str, joint: usize) -> Option<JointRows> {
         smooth: [Vec::new(), Vec::new()],
         q: log.q(name)?.to_vec(),
         dq: log.dq(name)?.to_vec(),
-        torque: log.tau_measured(name)?.to_vec(),
+        torque: if has_torque { log.tau_measured(name)?.to_vec() } else { vec![0.0; log.rows()] },
         command: [log.q_cmd(name)?.to_vec(), or_zero(log.dq_cmd(name)), or_zero(log.tau_ff(name))],
         gains: [kp?, kd?],
         temperature: log.channel(&format!("temp_{name}")).map_or(Vec::new(), filled),
@@ -186,20 +194,38 @@ fn vectors<const N: usize>(log: &Log, names: [&str; N]) -> Option<Vec<[f64; N]>>
     Some((0..log.rows()).map(|row| std::array::from_fn(|axis| channels[axis][row])).collect())
 }
 
-fn base_rows(log: &Log) -> Option<BaseRows> {
+fn base_rows(log: &Log, t: &[f64], ranges: &[Range<usize>]) -> Option<BaseRows> {
+    let names = ["gyro_x", "gyro_y", "gyro_z"];
+    let gyro = vectors(log, names)?;
+    let smooth = |axis: usize| {
+        let noise = log.noise(names[axis]).filter(|noise| *noise > 0.0);
+        let noise = noise.map_or((GYRO_NOISE, false), |noise| (noise, true));
+        let readings: Vec<f64> = gyro.iter().map(|reading| reading[axis]).collect();
+        let [smooth, _] = smoothed(t, [&readings, &vec![f64::NAN; t.len()]], [noise, (1.0, true)], ranges);
+        smooth
+    };
+    let smooth = [0, 1, 2].map(smooth);
     Some(BaseRows {
         orientation: vectors(log, ["quat_w", "quat_x", "quat_y", "quat_z"])?,
-        gyro: vectors(log, ["gyro_x", "gyro_y", "gyro_z"])?,
+        smooth_gyro: (0..t.len()).map(|row| [0, 1, 2].map(|axis| smooth[axis][row])).collect(),
+        gyro,
         acceleration: vectors(log, ["acc_x", "acc_y", "acc_z"]).unwrap_or_default(),
         velocity: vectors(log, ["vel_x", "vel_y", "vel_z"]).unwrap_or_default(),
     })
 }
 
 fn contact_rows(log: &Log, robot: &Robot) -> Vec<Vec<Option<bool>>> {
-    let of = |name: &str| log.channel(&format!("contact_{name}"));
-    let channels: Option<Vec<&[f64]>> = robot.feet.iter().map(|foot| of(&foot.name)).collect();
-    let touches = |cell: &f64| cell.is_finite().then_some(*cell > 0.5);
-    channels.map_or(Vec::new(), |all| all.into_iter().map(|cells| cells.iter().map(touches).collect()).collect())
+    // A force within its noise is none; without a stated noise any force may be one.
+    let noise = |foot: &str| log.noise(&format!("foot_force_{foot}")).filter(|noise| *noise > 0.0);
+    let of = |foot: &str| -> Option<(&[f64], f64)> {
+        let of_force = || Some((log.channel(&format!("foot_force_{foot}"))?, 3.0 * noise(foot)?));
+        log.channel(&format!("contact_{foot}")).map(|cells| (cells, 0.5)).or_else(of_force)
+    };
+    let channels: Option<Vec<_>> = robot.feet.iter().map(|foot| of(&foot.name)).collect();
+    let touches = |(cells, least): (&[f64], f64)| {
+        cells.iter().map(|cell| cell.is_finite().then_some(*cell > least)).collect::<Vec<_>>()
+    };
+    channels.map_or(Vec::new(), |all| all.into_iter().map(touches).collect())
 }
 
 fn split_at_gaps(t: &[f64], range: Range<usize>) -> Vec<Range<usize>> {

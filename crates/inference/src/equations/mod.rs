@@ -45,6 +45,7 @@ mod system;
 #[cfg(test)]
 mod tests;
 mod torque_residuals;
+mod undetermined;
 mod unknown;
 
 pub use causes::UnknownLaw;

@@ -15,6 +15,8 @@ use super::unknown;
 
 /// Gain from which a law that the catalogue does not have is reported [nat].
 const LEAST_UNKNOWN: f64 = 10.0;
+/// Spreads of the gains of the joints of a robot, beside the usual one.
+const GAIN_SPREADS: [f64; 3] = [0.001, 0.03, 0.1];
 /// Standard deviations of a normal distribution within which 95 % are, on both sides and below.
 pub const TWO_SIDED_95: f64 = 1.96;
 const ONE_SIDED_95: f64 = 1.645;
@@ -95,7 +97,7 @@ impl<R: Residuals> Search<'_, R> {
         let unknown = self.unknown_laws(&best);
         Found {
             // What joints have a little of has their gains.
-            gains_differ: little.is_empty() && gains_differ(&best),
+            gains: if little.is_empty() { self.gains(&best) } else { Vec::new() },
             causes,
             little,
             left,
@@ -103,6 +105,41 @@ impl<R: Residuals> Search<'_, R> {
             unknown,
             correlations,
         }
+    }
+
+    /// Returns the scales of position and velocity gain by joint, if joints that differ are more likely than equal ones; else none.
+    ///
+    /// By how much the gains of a robot differ is not known before: it is what is most likely, from the usual to all that is no cause.
+    fn gains(&self, best: &Fitted<R>) -> Vec<[f64; 2]> {
+        let of_gains = || best.small.groups.iter().filter(|group| group.gain.is_some());
+        if of_gains().next().is_none() {
+            return Vec::new();
+        }
+        let with_spread = |spread: f64| {
+            let wider = of_gains().map(|group| Group::independent(group.columns.clone(), spread)).collect();
+            Self::posterior_with(best, best, wider)
+        };
+        let likeliest =
+            GAIN_SPREADS.into_iter().map(with_spread).max_by(|one, other| one.evidence.total_cmp(&other.evidence));
+        let posterior = likeliest.expect("some spreads");
+        let (mut scales, mut variances, mut place) = ([Vec::new(), Vec::new()], [0.0; 2], 0);
+        let mut wider = posterior.mean.len() - of_gains().count();
+        for group in &best.small.groups {
+            if let Some(gain) = group.gain {
+                scales[gain].push(1.0 + posterior.mean[place] + posterior.mean[wider]);
+                let of = |one: usize, other: usize| posterior.covariance[(one, other)];
+                variances[gain] += of(place, place) + of(wider, wider) + 2.0 * of(place, wider);
+                wider += 1;
+            }
+            place += group.columns.len();
+        }
+        let differ = |gain: usize| {
+            scales[gain].iter().map(|scale: &f64| (scale - 1.0).powi(2)).sum::<f64>() > 4.0 * variances[gain]
+        };
+        if !differ(0) && !differ(1) {
+            return Vec::new();
+        }
+        scales[0].iter().zip(&scales[1]).map(|(kp, kd)| [*kp, *kd]).collect()
     }
 
     /// Returns true if an unknown of a cause is larger than in 95 % of all robots, with a probability of 95 %.
@@ -157,19 +194,4 @@ impl<R: Residuals> Search<'_, R> {
         found.sort_by(|one, other| other.gain.total_cmp(&one.gain));
         found
     }
-}
-
-/// Returns true if the errors of either gain are twice as large as they are uncertain, root mean square over the joints.
-fn gains_differ<R: Residuals>(best: &Fitted<R>) -> bool {
-    // Squares of the estimates and of their standard deviations.
-    let mut squares = [[0.0; 2]; 2];
-    let mut place = 0;
-    for group in &best.small.groups {
-        if let Some(gain) = group.gain {
-            squares[gain][0] += best.posterior.mean[place].powi(2);
-            squares[gain][1] += best.posterior.covariance[(place, place)];
-        }
-        place += group.columns.len();
-    }
-    squares.iter().any(|[estimates, variances]| *estimates > 4.0 * variances)
 }

@@ -7,9 +7,10 @@ use glam::{DMat3, DQuat, DVec3};
 use twinstep_dynamics::Vec3;
 use twinstep_dynamics::tree::{TreeMotion, TreeParameters, TreeState, TreeStructure};
 
-use super::drive::link_torque;
+use super::drive::{inverse, link_torque};
 use super::measurements::{JointRows, Measurements, Regime};
 use super::robot::Robot;
+use super::undetermined::Weighting;
 
 /// Gravitational acceleration [m/s²].
 pub const GRAVITY: f64 = 9.81;
@@ -68,8 +69,12 @@ pub struct Sample {
     pub instrument: Motion,
     /// Weights of the rows.
     pub weights: Arc<Vec<f64>>,
+    /// Weights, positions and velocities at some of the rows, by joint: a mean of a law is not the law of a mean.
+    pub states: Vec<Vec<[f64; 3]>>,
     /// Forces and moments at the base per torque of a joint, by joint: not zero where the limb stands. Empty for a fixed base.
     pub base_per_torque: Vec<[f64; 6]>,
+    /// Weights of the balance of the base; `None` for a fixed base.
+    pub weighting: Option<Weighting>,
     /// True for a joint whose limb touches nothing, by joint.
     pub is_free: Vec<bool>,
     /// True for a joint that turns in one direction all the time, so that its dry friction is known, by joint.
@@ -95,9 +100,20 @@ impl Sample {
         motion
     }
 
-    /// Returns the link torque of the instrument for a motor torque [N·m].
+    /// Returns the mean link torque for a motor torque [N·m], with the acceleration of the instrument.
     pub fn link_torque(&self, robot: &Robot, joint: usize, motor: f64) -> f64 {
-        link_torque(&robot.joints[joint], motor, self.instrument.of(joint))
+        self.link_torque_at(robot, joint, motor, self.instrument.ddq[joint])
+    }
+
+    /// Returns the mean link torque for a motor torque [N·m] and an acceleration [rad/s²].
+    pub fn link_torque_at(&self, robot: &Robot, joint: usize, motor: f64, ddq: f64) -> f64 {
+        let torque = |[weight, q, dq]: &[f64; 3]| weight * link_torque(&robot.joints[joint], motor, [*q, *dq, ddq]);
+        self.states[joint].iter().map(torque).sum()
+    }
+
+    /// Returns the torque of the motor [N·m] that has this torque on the link, the inverse of [`Self::link_torque`].
+    pub fn motor_torque(&self, robot: &Robot, joint: usize, link: f64) -> f64 {
+        inverse(robot.joints[joint].actuator.gain, link, |motor| self.link_torque(robot, joint, motor))
     }
 
     /// Returns the state of a motion, with gravity turned by an angle about each axis of the base [rad].
@@ -142,7 +158,9 @@ pub fn samples(measured: &Measurements, robot: &Robot) -> Vec<Sample> {
                 continue;
             }
             if let Some(mut sample) = sample(measured, rows, regime, &weights[regime as usize]) {
-                if regime != Regime::Hang && !sample.set_feet(measured, robot, &structure, &bodies) {
+                if regime != Regime::Hang
+                    && (robot.feet.is_empty() || !sample.set_feet(measured, robot, &structure, &bodies))
+                {
                     continue;
                 }
                 samples.push(sample);
@@ -151,6 +169,9 @@ pub fn samples(measured: &Measurements, robot: &Robot) -> Vec<Sample> {
     }
     samples
 }
+
+/// Most rows of a sample at which laws of joints are evaluated.
+const MOST_STATES: usize = 8;
 
 /// Rows that the derivatives of a sample need before and after it.
 const MARGIN: usize = 12;
@@ -193,13 +214,36 @@ fn sample(measured: &Measurements, rows: Range<usize>, regime: Regime, weights: 
     let known = torques.is_finite() && numbers.copied().all(f64::is_finite);
     let t = 0.5 * (measured.t[rows.start] + measured.t[rows.end]);
     let weights = weights.clone();
+    let step = rows.len().div_ceil(MOST_STATES);
+    let kept = || rows.clone().zip(weights.iter()).step_by(step);
+    let sum_of_weights: f64 = kept().map(|(_, weight)| weight).sum();
+    let states = |joint: &JointRows| -> Vec<[f64; 3]> {
+        let state = |(row, weight): (usize, &f64)| {
+            let [q, dq] = [0, 1].map(|of| 0.5 * (joint.smooth[of][row] + joint.smooth[of][row + 1]));
+            [weight / sum_of_weights, q, dq]
+        };
+        kept().map(state).collect()
+    };
+    let states = joints().map(states).collect();
     let turns = |joint: &JointRows| {
         let speeds = &joint.smooth[1][rows.start..=rows.end];
         speeds.iter().all(|speed| *speed > LEAST_SPEED) || speeds.iter().all(|speed| *speed < -LEAST_SPEED)
     };
     let turns = joints().map(turns).collect();
     let (is_free, base_per_torque) = (vec![true; measured.joints.len()], Vec::new());
-    known.then_some(Sample { rows, t, regime, response, instrument, weights, base_per_torque, is_free, turns })
+    known.then_some(Sample {
+        rows,
+        t,
+        regime,
+        response,
+        instrument,
+        weights,
+        states,
+        base_per_torque,
+        weighting: None,
+        is_free,
+        turns,
+    })
 }
 
 /// Returns mean and derivative over the rows of a sample, given a value of each row.
@@ -222,7 +266,7 @@ fn base_motion(measured: &Measurements, rows: &Range<usize>, regime: Regime, of:
     if !known {
         return None;
     }
-    let gyro = [0, 1, 2].map(|index| axis(&base.gyro, index));
+    let gyro = [0, 1, 2].map(|index| axis(&base.smooth_gyro, index));
     let into_base = |world: [f64; 3]| {
         let [w, x, y, z] = orientations[0];
         (DQuat::from_xyzw(x, y, z, w).normalize().inverse() * DVec3::from_array(world)).to_array()
@@ -239,10 +283,12 @@ fn base_motion(measured: &Measurements, rows: &Range<usize>, regime: Regime, of:
     // One of several logs may lack the sensor.
     let [linear_acceleration, of_columns] = match felt.filter(|felt| felt.iter().all(|part| part.is_finite())) {
         Some(felt) => [felt, of_velocity.unwrap_or([0.0; 3])],
+        // A robot that stands is not accelerated for long.
+        None if regime == Regime::Stand => [of_velocity.unwrap_or([0.0; 3]), [0.0; 3]],
         None => [of_velocity?, [0.0; 3]],
     };
     let angular_velocity = gyro.map(|of| of[0]);
-    // Orientations are too noisy for angular accelerations, and those of the gyroscope have little noise.
+    // Orientations are too noisy for angular accelerations.
     let angular_acceleration = gyro.map(|of| of[1]);
     let response = BaseMotion { angular_velocity, angular_acceleration, linear_acceleration, ..turned[0] };
     let instrument =

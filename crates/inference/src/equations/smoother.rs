@@ -1,7 +1,9 @@
 //! Positions and velocities of a joint with less noise, by the smoother of a motion whose jerk is white (Rauch, Tung and Striebel 1965).
 //!
-//! The intensity of the jerk and the noise of the readings are those of highest likelihood. What a log states of its noise, or what is
-//! usual, is where their search begins: a drive that filters or differentiates has another noise of velocity.
+//! The noise of the readings and the intensity of the jerk in each block of rows are those of highest likelihood. What a log states of its
+//! noise, or what is usual, is where their search begins: a drive that filters or differentiates has another noise of velocity.
+//!
+//! The error of a smoothed motion is not correlated with it, so that it may be in a residual and in its columns.
 
 use std::ops::Range;
 
@@ -9,21 +11,29 @@ use nalgebra::{Matrix3, Vector3};
 
 /// Intensities of the jerk that are compared [rad²/s⁵]: from a joint at rest to impacts.
 const INTENSITIES: [f64; 9] = [1e0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8];
-/// Noise of the readings that is compared, relative to the given one.
+/// Noise of the readings that is compared, relative to the usual one, where the log states none.
 const NOISES: [f64; 5] = [0.3, 1.0, 3.0, 10.0, 30.0];
-/// Rows of a block, and most rows with which likelihoods are compared.
-const BLOCK: usize = 500;
+/// The same relative to what the log states. White jerk is not the law of a motion with impacts, which would pass for noise.
+const NEAR: [f64; 3] = [0.6, 1.0, 1.6];
+/// Rows of a block, and most rows with which noises are compared.
+const BLOCK: usize = 250;
 const MOST_ROWS: usize = 5000;
 /// Standard deviations of velocity [rad/s] and acceleration [rad/s²] before the first row: nothing is known.
 const START: [f64; 2] = [10.0, 1000.0];
 
 /// How a joint moves, and how it is measured.
-#[derive(Clone, Copy, Debug)]
-struct Model {
-    /// Intensity of the jerk [rad²/s⁵].
-    intensity: f64,
+struct Model<'a> {
+    /// Intensity of the jerk in each block [rad²/s⁵]; that of the last holds for all that follow.
+    intensities: &'a [f64],
     /// Variances of the readings of position and velocity.
     variance: [f64; 2],
+}
+
+impl Model<'_> {
+    /// Returns the intensity of the jerk before a row.
+    fn intensity(&self, row: usize) -> f64 {
+        self.intensities[(row / BLOCK).min(self.intensities.len() - 1)]
+    }
 }
 
 /// Readings of a joint in one contiguous range.
@@ -34,16 +44,18 @@ struct Readings<'a> {
     dq: &'a [f64],
 }
 
-/// Returns positions [rad] and velocities [rad/s] without most of their noise, given what that of the readings is about.
-pub fn smoothed(t: &[f64], [q, dq]: [&[f64]; 2], noise: [f64; 2], ranges: &[Range<usize>]) -> [Vec<f64>; 2] {
+/// Returns positions [rad] and velocities [rad/s] without most of their noise, given that of the readings, and whether the log states it.
+pub fn smoothed(t: &[f64], [q, dq]: [&[f64]; 2], noise: [(f64, bool); 2], ranges: &[Range<usize>]) -> [Vec<f64>; 2] {
     let part = |range: &Range<usize>| {
         let [t, q, dq] = [t, q, dq].map(|series| &series[range.clone()]);
         Readings { t, q, dq }
     };
-    let model = likeliest(&ranges.iter().map(part).collect::<Vec<_>>(), noise);
+    let variance = likeliest_noise(&ranges.iter().map(part).collect::<Vec<_>>(), noise);
     let mut smooth = [q.to_vec(), dq.to_vec()];
     for range in ranges {
-        for (row, state) in range.clone().zip(part(range).smoothed(model)) {
+        let intensities: Vec<f64> = part(range).blocks().map(|block| block.likeliest_motion(variance).1).collect();
+        let model = Model { intensities: &intensities, variance };
+        for (row, state) in range.clone().zip(part(range).smoothed(&model)) {
             for (series, value) in smooth.iter_mut().zip([state.x, state.y]) {
                 // A missing reading stays missing.
                 if series[row].is_finite() {
@@ -55,20 +67,19 @@ pub fn smoothed(t: &[f64], [q, dq]: [&[f64]; 2], noise: [f64; 2], ranges: &[Rang
     smooth
 }
 
-/// Returns the model of highest likelihood, from some blocks of the readings.
-fn likeliest(parts: &[Readings], noise: [f64; 2]) -> Model {
+/// Returns the variances of the readings of highest likelihood, from some blocks.
+fn likeliest_noise(parts: &[Readings], noise: [(f64, bool); 2]) -> [f64; 2] {
     let blocks: Vec<Readings> = parts.iter().flat_map(Readings::blocks).collect();
     let step = (blocks.len() * BLOCK).div_ceil(MOST_ROWS).max(1);
-    let likelihood = |model: Model| blocks.iter().step_by(step).map(|block| block.filtered(model).1).sum::<f64>();
-    let models = INTENSITIES.into_iter().flat_map(|intensity| {
-        let with = move |[q, dq]: [f64; 2]| {
-            let variance = [q * noise[0], dq * noise[1]].map(|noise| noise * noise);
-            Model { intensity, variance }
-        };
-        NOISES.into_iter().flat_map(move |q| NOISES.map(|dq| with([q, dq])))
+    let likelihood =
+        |variance: [f64; 2]| blocks.iter().step_by(step).map(|block| block.likeliest_motion(variance).0).sum::<f64>();
+    let [of_q, of_dq] = noise.map(|(noise, is_stated)| {
+        let relative: &[f64] = if is_stated { &NEAR } else { &NOISES };
+        relative.iter().map(|relative| (relative * noise).powi(2)).collect::<Vec<f64>>()
     });
-    let scored = models.map(|model| (likelihood(model), model));
-    scored.max_by(|one, other| one.0.total_cmp(&other.0)).expect("some models").1
+    let variances = of_q.iter().flat_map(|q| of_dq.iter().map(|dq| [*q, *dq]));
+    let scored = variances.map(|variance| (likelihood(variance), variance));
+    scored.max_by(|one, other| one.0.total_cmp(&other.0)).expect("some variances").1
 }
 
 /// Mean and covariance of position, velocity and acceleration.
@@ -80,15 +91,22 @@ impl<'a> Readings<'a> {
         cells.map(|((t, q), dq)| Readings { t, q, dq })
     }
 
+    /// Returns the highest log-likelihood over the intensities of the jerk, and that intensity.
+    fn likeliest_motion(&self, variance: [f64; 2]) -> (f64, f64) {
+        let of = |intensity: f64| (self.filtered(&Model { intensities: &[intensity], variance }).1, intensity);
+        let scored = INTENSITIES.into_iter().map(of);
+        scored.max_by(|one, other| one.0.total_cmp(&other.0)).expect("some intensities")
+    }
+
     /// Returns the beliefs before and after the readings of each row, and the log-likelihood.
-    fn filtered(&self, model: Model) -> (Vec<[Belief; 2]>, f64) {
+    fn filtered(&self, model: &Model) -> (Vec<[Belief; 2]>, f64) {
         let first = self.q.iter().copied().find(|q| q.is_finite()).unwrap_or(0.0);
         let mut mean = Vector3::new(first, 0.0, 0.0);
         let mut covariance = Matrix3::from_diagonal(&Vector3::new(1.0, START[0] * START[0], START[1] * START[1]));
         let (mut beliefs, mut likelihood) = (Vec::with_capacity(self.q.len()), 0.0);
         for row in 0..self.q.len() {
             if row > 0 {
-                let (turn, spread) = motion(self.t[row] - self.t[row - 1], model.intensity);
+                let (turn, spread) = motion(self.t[row] - self.t[row - 1], model.intensity(row));
                 mean = turn * mean;
                 covariance = turn * covariance * turn.transpose() + spread;
             }
@@ -109,11 +127,11 @@ impl<'a> Readings<'a> {
     }
 
     /// Returns position, velocity and acceleration of each row, given all readings.
-    fn smoothed(&self, model: Model) -> Vec<Vector3<f64>> {
+    fn smoothed(&self, model: &Model) -> Vec<Vector3<f64>> {
         let (beliefs, _) = self.filtered(model);
         let mut states: Vec<Vector3<f64>> = beliefs.iter().map(|[_, (mean, _)]| *mean).collect();
         for row in (0..states.len().saturating_sub(1)).rev() {
-            let (turn, _) = motion(self.t[row + 1] - self.t[row], model.intensity);
+            let (turn, _) = motion(self.t[row + 1] - self.t[row], model.intensity(row + 1));
             let ([_, (mean, covariance)], [(predicted, spread), _]) = (beliefs[row], beliefs[row + 1]);
             let Some(inverse) = spread.try_inverse() else { continue };
             states[row] = mean + covariance * turn.transpose() * inverse * (states[row + 1] - predicted);
@@ -134,7 +152,7 @@ mod tests {
     use super::*;
 
     /// Returns the errors of smoothed readings relative to their noise, at a rate, given the noise that the log states.
-    fn errors(frequency: f64, noise: [f64; 2], stated: [f64; 2], rate_hz: f64) -> [f64; 2] {
+    fn errors(frequency: f64, noise: [f64; 2], stated: Option<[f64; 2]>, rate_hz: f64) -> [f64; 2] {
         let mut seed = 7_u64;
         let mut normal = || {
             let mut uniform = || {
@@ -152,7 +170,8 @@ mod tests {
         let mut read =
             |index: usize| -> Vec<f64> { truth[index].iter().map(|value| value + noise[index] * normal()).collect() };
         let readings = [read(0), read(1)];
-        let smooth = smoothed(&t, [&readings[0], &readings[1]], stated, &[0..900, 900..t.len()]);
+        let given = stated.map_or([(1e-4, false), (0.01, false)], |stated| stated.map(|noise| (noise, true)));
+        let smooth = smoothed(&t, [&readings[0], &readings[1]], given, &[0..900, 900..t.len()]);
         [0, 1].map(|index| {
             let squares = smooth[index].iter().zip(&truth[index]).map(|(one, other)| (one - other).powi(2));
             (squares.sum::<f64>() / t.len() as f64).sqrt() / noise[index]
@@ -162,19 +181,19 @@ mod tests {
     #[test]
     fn slow_motions_lose_most_of_their_noise_and_fast_ones_keep_their_size() {
         let noise = [1e-3, 0.05];
-        let slow = errors(1.0, noise, noise, 200.0);
+        let slow = errors(1.0, noise, Some(noise), 200.0);
         assert!(slow[0] < 0.5 && slow[1] < 0.5, "{slow:?}");
         // A parabola through seven rows takes 0.85 % of such a motion away: 1.8 times the noise of the position.
-        let fast = errors(12.0, noise, noise, 200.0);
+        let fast = errors(12.0, noise, Some(noise), 200.0);
         assert!(fast[0] < 1.0 && fast[1] < 1.5, "{fast:?}");
-        let quick = errors(3.0, noise, noise, 4000.0);
+        let quick = errors(3.0, noise, Some(noise), 4000.0);
         assert!(quick[0] < 0.3 && quick[1] < 0.3, "{quick:?}");
     }
 
     #[test]
     fn noise_that_a_log_does_not_state_is_found() {
         for noise in [[1e-4, 0.3], [3e-3, 0.01], [2e-3, 0.2]] {
-            let smooth = errors(1.0, noise, [1e-4, 0.01], 500.0);
+            let smooth = errors(1.0, noise, None, 500.0);
             assert!(smooth[0] < 0.9 && smooth[1] < 0.9, "{noise:?}: {smooth:?}");
         }
     }

@@ -35,13 +35,10 @@ pub struct System {
     drive_rows: Vec<Vec<(usize, Vec<usize>)>>,
     /// Blocks of the gyroscope, with the rows of the log.
     gyro_rows: Vec<(usize, Vec<usize>)>,
-    /// Measured torques minus those of the reference on the readings, plus those on smooth readings, by joint and row [N·m].
-    ///
-    /// Torques of other robots are computed on smooth readings, unless the controller had those of the log. With noise that is not in the
-    /// torques, a lag of the drive would reduce it.
-    first_residual: Vec<Vec<f64>>,
     /// The robot whose residuals are from measured torques.
     reference: Robot,
+    /// Mean torques of its motors on smooth readings, by joint and sample; empty if torques were measured [N·m].
+    first_motors: Vec<Vec<f64>>,
     /// Small unknowns of bodies and their motion.
     pub of_bodies: OnceLock<Vec<Group>>,
 }
@@ -78,6 +75,9 @@ impl System {
 
     /// Collects the equations of a log.
     pub fn new(mut measured: Measurements, robot: &Robot) -> Self {
+        if !measured.has_torque {
+            measured.set_torques_of_drives(robot);
+        }
         let mut blocks = Vec::new();
         let drive_rows = drive_blocks(&measured, robot, &mut blocks);
         let gyro_rows = gyro_blocks(&measured, &mut blocks);
@@ -91,33 +91,26 @@ impl System {
             measured.joints.par_iter().map(of).collect()
         };
         let [raw, smooth] = [lacking(false), lacking(true)];
-        let has_readings = roughness(&raw) < roughness(&smooth);
+        let has_readings = measured.has_torque && roughness(&raw) < roughness(&smooth);
         if has_readings {
             for rows in &mut measured.joints {
                 rows.smooth = [rows.q.clone(), rows.dq.clone()];
             }
         }
-        // The part of the readings that is not in the smooth ones is in the torque of the reference only.
-        let of_smooth = measured
-            .joints
-            .par_iter()
-            .map(|rows| sensed_torque(&measured, rows, [&rows.smooth[0], &rows.smooth[1]], robot));
-        let of_smooth: Vec<Vec<f64>> = of_smooth.collect();
-        let first_residual = raw
-            .iter()
-            .zip(&of_smooth)
-            .map(|(lacking, sensed)| lacking.iter().zip(sensed).map(|(lacking, sensed)| lacking + sensed).collect());
-        let first_residual = first_residual.collect();
-        Self {
+        let mut system = Self {
             measured,
             balance,
             blocks,
             drive_rows,
             gyro_rows,
-            first_residual,
             reference: robot.clone(),
+            first_motors: Vec::new(),
             of_bodies: OnceLock::new(),
+        };
+        if !system.measured.has_torque {
+            system.first_motors = system.predicted(robot).motor;
         }
+        system
     }
 
     /// Returns the torques of the drives of a robot.
@@ -158,8 +151,8 @@ impl System {
         let mut blocks = self.blocks.clone();
         for (joint, parts) in self.drive_rows.iter().enumerate() {
             for (block, rows) in parts {
-                let [first, change] = [&self.first_residual[joint], &predicted.sensed[joint]];
-                let residual = |row: &usize| first[*row] - change[*row];
+                let [measured, sensed] = [&self.measured.joints[joint].torque, &predicted.sensed[joint]];
+                let residual = |row: &usize| measured[*row] - sensed[*row];
                 blocks[*block].y = rows.iter().map(residual).collect();
             }
         }
@@ -180,7 +173,12 @@ impl System {
             predicted.motor[joint].iter().zip(on_time).map(|(now, before)| now - before).collect()
         };
         let late: Vec<Vec<f64>> = (0..robot.joints.len()).map(late).collect();
-        self.balance.write_residuals(robot, &predicted.needed, &predicted.balanced, &late, &mut blocks);
+        if self.measured.has_torque {
+            self.balance.write_residuals(robot, &predicted.needed, &predicted.balanced, &late, &mut blocks);
+        } else {
+            let motors = [predicted.motor.as_slice(), &self.first_motors];
+            self.balance.write_drive_residuals(robot, &predicted.needed, motors, &mut blocks);
+        }
         blocks
     }
 
@@ -220,6 +218,9 @@ impl System {
 
     /// Returns the column of an offset of a joint's torque sensor, per N·m.
     pub fn torque_offset(&self, joint: usize) -> Column {
+        if !self.measured.has_torque {
+            return Column::default();
+        }
         let mut parts: Vec<(usize, Vec<f64>)> =
             self.drive_rows[joint].iter().map(|(block, rows)| (*block, vec![1.0; rows.len()])).collect();
         // The motor has less torque than the sensor reads.
@@ -230,6 +231,15 @@ impl System {
 
     fn drive_column(&self, joint: usize, predicted: &Predicted, after: &Robot) -> Column {
         let sensed = self.sensed(&self.measured.joints[joint], after);
+        if !self.measured.has_torque {
+            let change = |(index, motor): (usize, f64)| {
+                let sample = &self.balance.samples[index];
+                sample.link_torque(after, joint, motor)
+                    - sample.link_torque(after, joint, predicted.motor[joint][index])
+            };
+            let changes: Vec<f64> = self.motor(after, joint, &sensed).into_iter().enumerate().map(change).collect();
+            return self.balance.joint_column(joint, &changes);
+        }
         let part = |(block, rows): &(usize, Vec<usize>)| {
             let change = |row: &usize| sensed[*row] - predicted.sensed[joint][*row];
             (*block, rows.iter().map(change).collect())
@@ -295,6 +305,9 @@ fn rows_of(time: f64, measured: &Measurements) -> usize {
 }
 
 fn drive_blocks(measured: &Measurements, robot: &Robot, blocks: &mut Vec<Block>) -> Vec<Vec<(usize, Vec<usize>)>> {
+    if !measured.has_torque {
+        return vec![Vec::new(); measured.joints.len()];
+    }
     let skipped = rows_of(HISTORY_S, measured);
     let mut all = Vec::new();
     for rows in &measured.joints {

@@ -57,9 +57,10 @@ pub fn columns(system: &System, predicted: &Predicted, joint: usize, place: Plac
     let rows = &system.measured.joints[joint];
     let temperature = |row: usize| rows.temperature.get(row).copied().unwrap_or(0.0);
     let of_row = |row: usize| {
-        let error = rows.command[0][row] - rows.q[row];
+        let [q, dq] = [0, 1].map(|quantity| rows.smooth[quantity][row]);
+        let error = rows.command[0][row] - q;
         let torque = predicted.sensed(joint)[row];
-        [rows.q[row], rows.dq[row], error, torque, temperature(row), system.measured.t[row]]
+        [q, dq, error, torque, temperature(row), system.measured.t[row]]
     };
     let samples = &system.balance.samples;
     let of_sample = |index: usize| {
