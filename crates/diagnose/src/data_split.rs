@@ -76,16 +76,11 @@ impl DataSplit {
     }
 
     /// Returns the block of a row; `None` for rows that take no part in any selection or fit.
-    pub fn block(&self, row: usize) -> Option<usize> {
+    fn block(&self, row: usize) -> Option<usize> {
         match self.parts[row] {
             Part::Block(block) => Some(block),
             Part::HeldOut | Part::Gap => None,
         }
-    }
-
-    /// Returns the number of blocks.
-    pub fn num_blocks(&self) -> usize {
-        (0..self.parts.len()).filter_map(|row| self.block(row)).max().map_or(0, |last| last + 1)
     }
 
     /// Returns true if a row is held out.

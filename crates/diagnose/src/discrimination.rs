@@ -7,7 +7,7 @@ use twinstep_model::{
     BaseMount, FIXED_BASE_HEIGHT, Ground, InitialState, JOINT_NAMES, Precision, RobotModel, Rollout, RolloutRequest,
 };
 
-use super::cross_validation::FitProblem;
+use super::fit_problem::FitProblem;
 use super::hypothesis::Hypothesis;
 use super::residual_data::ResidualData;
 use super::residual_power::{CHANNELS, ResidualPower};
@@ -107,7 +107,7 @@ fn gauss_newton_refit(fit: &FitProblem, evidence: &ResidualData, simulator: &mut
         fit.model(&task.from_prior_units(&moved)).robot_model().ok()
     };
     let robots: Vec<RobotModel> = STEPS.into_iter().filter_map(moved).collect();
-    let left = evidence.residual_powers(simulator, &robots, false).into_iter().filter(|left| !left.diverged());
+    let left = evidence.residual_powers(simulator, &robots).into_iter().filter(|left| !left.diverged());
     left.min_by(|one, other| expected_gain(evidence, one).total_cmp(&expected_gain(evidence, other)))
 }
 

@@ -8,12 +8,13 @@ use twinstep_model::{BaseMount, RobotModel, Rollout};
 use super::discrimination::HypothesisPair;
 use super::hypothesis::Hypothesis;
 use super::residual_data::ResidualData;
-use super::{AMBIGUITY_NATS, Accepted, ambiguous};
 use crate::excitation::{EXCITATION_TRAJECTORIES, ExcitationTrajectory};
 use crate::findings::{CorrelatedPair, DiscriminatedPair, NextExperiment};
 
 /// Maximum number of pairs of causes; each is simulated with every trajectory.
 const MAX_PAIRS: usize = 4;
+/// Expected log-likelihood ratio below which a trajectory does not discriminate [nat]. Simulators of the same law differ by as much.
+const LEAST_RATIO: f64 = 6.0;
 
 /// Proposed experiment with its commands.
 #[derive(Clone, Debug)]
@@ -57,24 +58,27 @@ pub fn next_motion(
             median_nats: all[all.len() / 2],
         }
     });
-    let parts: Vec<_> = parts.filter(|part| part.predicted_nats >= AMBIGUITY_NATS).collect();
+    let parts: Vec<_> = parts.filter(|part| part.predicted_nats >= LEAST_RATIO).collect();
     let text = words(&motions[best], &parts)?;
     let said = NextExperiment { motion: String::new(), parts, text };
     Some(ProposedExperiment { summary: said, motion: motions[best].motion(robot) })
 }
 
-/// Returns pairs of causes with ambiguous alternatives, and pairs of causes with highly correlated estimates.
-pub fn pairs(extended: &ModelFile, accepted: &Accepted, confusable: &[CorrelatedPair]) -> Vec<HypothesisPair> {
+/// Returns pairs of causes with their ambiguous alternatives, and pairs of causes with highly correlated estimates.
+pub fn pairs(
+    extended: &ModelFile,
+    causes: &[(Hypothesis, Vec<Hypothesis>)],
+    confusable: &[CorrelatedPair],
+) -> Vec<HypothesisPair> {
     let mut pairs = Vec::new();
-    for (best, others) in accepted {
-        let close = ambiguous(best, others);
-        pairs.extend(close.map(|other| hypothesis_pair(extended, &best.hypothesis, &other.hypothesis)));
+    for (cause, others) in causes {
+        pairs.extend(others.iter().map(|other| hypothesis_pair(extended, cause, other)));
     }
     for pair in confusable {
-        let [one, other] = pair.effects.each_ref().map(|name| {
-            let mut named = accepted.iter().map(|(best, _)| &best.hypothesis);
-            named.find(|hypothesis| hypothesis.effect.name == name)
-        });
+        let [one, other] = pair
+            .effects
+            .each_ref()
+            .map(|name| causes.iter().map(|(cause, _)| cause).find(|cause| cause.effect.name == name));
         pairs.extend(one.zip(other).map(|(one, other)| hypothesis_pair(extended, one, other)));
     }
     pairs.retain(|pair| pair.effects().iter().all(|effect| effect.search.predictable));

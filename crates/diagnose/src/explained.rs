@@ -8,10 +8,9 @@ use twinstep_inference::equations::{Explained, Explanation, UnknownLaw};
 use super::findings::{
     AlternativeCause, Cause, CorrelatedPair, Estimate, ParameterValue, Unexplained, WeightedHypothesis,
 };
-use super::{reporting, unexplained};
 
 /// Evidence by which a cause must be better than without it [nat].
-pub const LEAST_GAIN: f64 = 3.0;
+const LEAST_GAIN: f64 = 3.0;
 /// Evidence by which a rival may be worse than a cause, and still be as good an explanation: odds of 20 to 1 [nat].
 pub const AMBIGUOUS: f64 = 3.0;
 /// Absolute correlation of two estimates from which they are reported.
@@ -24,7 +23,7 @@ const LEAST_LEFT: f64 = 0.02;
 pub fn unexplained_law(found: &Explained) -> Unexplained {
     let Some(UnknownLaw { joint, of_drive, variable, gain }) = found.unknown.first() else {
         if !found.is_of_positions || found.left < LEAST_LEFT {
-            return unexplained::only_noise();
+            return only_noise();
         }
         let text = format!(
             "The causes leave {:.0} % of the squared position errors above the noise. Torques are not measured, so that their law is not \
@@ -41,6 +40,21 @@ pub fn unexplained_law(found: &Explained) -> Unexplained {
         "{place} of {joint} has another law, which the catalogue does not have: a function of {channel} and others explains what the causes leave, with {gain:.0} nat.{more}"
     );
     Unexplained { fraction: found.left, depends_on: vec![channel], text }
+}
+
+/// Returns the result for a residual that does not exceed noise.
+fn only_noise() -> Unexplained {
+    Unexplained { fraction: 0.0, depends_on: Vec::new(), text: "The residual is noise.".to_owned() }
+}
+
+/// Returns the experiment that discriminates between two effects.
+fn experiment_between(one: &Effect, other: &Effect) -> String {
+    let known = |from: &Effect, to: &Effect| {
+        let mut confounders = from.confounders.iter();
+        confounders.find(|confounder| confounder.effect == to.name).map(|found| found.discriminating_experiment)
+    };
+    let experiment = known(one, other).or_else(|| known(other, one));
+    experiment.unwrap_or("A different motion, with other speeds and loads.").to_owned()
 }
 
 /// Returns the entries of the extended model that are no cause. `joints` are the names of the robot's joints.
@@ -65,7 +79,7 @@ pub fn confusable(found: &Explained) -> Vec<CorrelatedPair> {
         CorrelatedPair {
             effects: [one.name.to_owned(), other.name.to_owned()],
             correlation: *correlation,
-            experiment: reporting::experiment_between(one, other),
+            experiment: experiment_between(one, other),
         }
     };
     found.correlations.iter().filter(is_high).map(pair).collect()

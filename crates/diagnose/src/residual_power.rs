@@ -3,9 +3,7 @@
 use std::ops::Range;
 
 use twinstep_effects::Target;
-use twinstep_model::{JOINT_NAMES, NUM_JOINTS};
-
-use twinstep_identify::nuisance;
+use twinstep_model::NUM_JOINTS;
 
 /// Number of channels: joint positions with a fixed base, torques, base position, orientation, velocity and angular
 /// velocity, joint positions with a floating base, force and moment on the base of a standing robot, and joint positions
@@ -29,23 +27,6 @@ pub const GYRO_AT_REST: usize = WRENCH + 6;
 /// First channel of a robot that walks or jumps: joint positions, then base position, orientation, velocity and angular
 /// velocity.
 pub const DYNAMIC: usize = GYRO_AT_REST + 3;
-
-/// Returns the name of a channel of a Go2, as the start of a sentence.
-pub fn channel_name(channel: usize) -> String {
-    let axis = ["x", "y", "z"][channel % 3];
-    match channel {
-        TORQUE..TRUNK => format!("The torque of {}", JOINT_NAMES[channel - TORQUE]),
-        TRUNK..GYRO => {
-            let quantity = ["position", "orientation", "velocity"][(channel - TRUNK) / 3];
-            format!("The {quantity} of the base ({axis})")
-        }
-        GYRO..STANCE => format!("The angular velocity of the base ({axis})"),
-        WRENCH..GYRO_AT_REST => {
-            format!("The {} on the base ({axis})", if channel < WRENCH + 3 { "force" } else { "moment" })
-        }
-        _ => format!("The position of {}", JOINT_NAMES[channel % 12]),
-    }
-}
 
 /// Returns the channels that are evidence about effects on these targets.
 pub fn evident_channels(targets: impl IntoIterator<Item = Target>) -> Range<usize> {
@@ -119,38 +100,15 @@ impl ResidualPower {
         0.5 * count / rows * ((then + 1e-9) / (now + 1e-9)).ln()
     }
 
-    /// Returns the power above noise and model error of all channels, and of the robot's nuisance parameters.
-    pub fn power_above_noise(&self) -> f64 {
-        (0..DYNAMIC).map(|channel| self.channel_excess(channel)).sum::<f64>() + self.tolerated_excess()
-    }
-
     /// Returns true if a torque or a position with a fixed base has more than `least` times the power of noise above it.
     pub fn shows_missing_torque(&self, least: f64) -> bool {
         let count = |channel: usize| self.counts[channel].iter().sum::<f64>();
         (0..TRUNK).any(|channel| self.channel_excess(channel) > least * count(channel))
     }
 
-    /// Returns the power by which the robot's nuisance parameters exceed their expectation.
-    pub fn tolerated_excess(&self) -> f64 {
-        nuisance::excess(self.nuisance_cost[1])
-    }
-
     /// Returns the power above noise and model error of a channel.
-    pub fn channel_excess(&self, channel: usize) -> f64 {
+    fn channel_excess(&self, channel: usize) -> f64 {
         let sum: f64 = self.sums[channel].iter().sum();
         (sum - self.counts[channel].iter().sum::<f64>()).max(0.0)
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn channels_have_the_names_of_their_quantities() {
-        assert_eq!(channel_name(14), "The torque of FL_calf");
-        assert_eq!(channel_name(STANCE + 3), "The position of FR_hip");
-        assert_eq!(channel_name(WRENCH + 4), "The moment on the base (y)");
-        assert_eq!(channel_name(TRUNK + 5), "The orientation of the base (z)");
     }
 }

@@ -1,13 +1,11 @@
 //! Residuals of rows of logs, with the channel and fold of each.
 
-use std::collections::BTreeSet;
-
 use rayon::prelude::*;
 use twinstep_effects::Target;
 use twinstep_model::{NUM_JOINTS, Precision, RobotModel, Rollout};
 
 use super::data_split::DataSplit;
-use super::residual_power::{CHANNELS, DYNAMIC, GYRO_AT_REST, ResidualPower, STANCE, TORQUE, TRUNK, WRENCH};
+use super::residual_power::{DYNAMIC, GYRO_AT_REST, ResidualPower, STANCE, TRUNK, WRENCH};
 use twinstep_identify::experiment::{Experiment, Regime, ResidualChannel};
 use twinstep_identify::least_squares::append;
 use twinstep_identify::nuisance::NuisanceModel;
@@ -17,7 +15,7 @@ pub const PRECISION: Precision = Precision::Single;
 /// Number of candidates that are simulated at once, which limits memory.
 const BATCH_SIZE: usize = 32;
 /// Standard deviation of the model error of joint positions [rad].
-pub const MODEL_ERROR_RAD: f64 = 0.001;
+const MODEL_ERROR_RAD: f64 = 0.001;
 /// Standard deviation of the model error of base motion [noise std].
 const MODEL_ERROR_BASE: f64 = 1.0;
 /// Standard deviation of the model error of the gyroscope [noise std].
@@ -40,10 +38,6 @@ pub struct ResidualRows {
     pub tolerances: Option<NuisanceModel>,
     /// Channel, fold and weight of every residual.
     cells: Vec<(usize, Option<usize>, f64)>,
-    /// Fold of every residual, also of those that only take part in fits.
-    folds: Vec<Option<usize>>,
-    /// Block of every residual, counted over all logs.
-    blocks: Vec<Option<usize>>,
     /// True for the residuals of a robot that walks or jumps.
     dynamic: Vec<bool>,
     /// True for the simulated residuals of a standing robot.
@@ -57,9 +51,7 @@ pub struct ResidualRows {
 impl ResidualRows {
     /// Creates the residuals of `experiments`, one for each log, which is divided as in `splits`.
     pub fn new(splits: &[DataSplit], experiments: Vec<Experiment>) -> Self {
-        let (mut cells, mut folds, mut blocks, mut dynamic) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
-        let (mut stance, mut balanced) = (Vec::new(), Vec::new());
-        let mut first_block = 0;
+        let (mut cells, mut dynamic, mut stance, mut balanced) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
         let hangs = experiments.iter().any(Experiment::has_fixed_base);
         for (split, experiment) in splits.iter().zip(&experiments) {
             dynamic.extend(experiment.dynamic_residuals());
@@ -71,9 +63,6 @@ impl ResidualRows {
                 }),
             );
             balanced.resize(stance.len(), has_wrench);
-            let block = |row: usize| split.block(row).map(|block| first_block + block);
-            blocks.extend(experiment.residual_index().map(|(_, row)| block(row)));
-            folds.extend(experiment.residual_index().map(|(_, row)| split.fold(row)));
             cells.extend(experiment.residual_index().zip(experiment.groups()).map(|((quantity, row), group)| {
                 // Torques are evaluated without simulation.
                 let regime = Experiment::regime(group);
@@ -99,9 +88,8 @@ impl ResidualRows {
                 };
                 (channel, split.fold(row), 1.0 / misfit.hypot(1.0))
             }));
-            first_block += split.num_blocks();
         }
-        Self { experiments, tolerances: None, cells, folds, blocks, dynamic, stance, balanced, hangs }
+        Self { experiments, tolerances: None, cells, dynamic, stance, balanced, hangs }
     }
 
     /// Raises the scales of residuals with errors of contact in a fit of effects on `targets`.
@@ -117,38 +105,6 @@ impl ResidualRows {
         let stance = scale.iter_mut().zip(self.stance.iter().zip(&self.balanced));
         let stance = stance.filter(|(_, (stance, balanced))| **stance && uncertain(**balanced));
         stance.for_each(|(scale, _)| *scale *= STANCE_SCALE);
-    }
-
-    /// Returns the weight of a residual in a fit to one fold: 1 for a row of the fold, 0 for another, and one half for the
-    /// penalty of a nuisance parameter, which follows the rows and belongs to both folds.
-    pub fn weight_in_fold(&self, residual: usize, fold: usize) -> f64 {
-        self.folds.get(residual).map_or(0.5, |of| f64::from(*of == Some(fold)))
-    }
-
-    /// Returns the residuals of joint positions with a fixed base in the first and in the second half of their blocks.
-    pub fn halves_in_air(&self) -> [Vec<usize>; 2] {
-        let blocks = self
-            .cells
-            .iter()
-            .zip(&self.blocks)
-            .map(|((channel, fold, _), block)| block.filter(|_| fold.is_some() && *channel < TORQUE));
-        let shown: Vec<(usize, usize)> =
-            blocks.enumerate().filter_map(|(residual, block)| Some((residual, block?))).collect();
-        let numbers: BTreeSet<usize> = shown.iter().map(|(_, block)| *block).collect();
-        let middle = numbers.iter().nth(numbers.len() / 2).copied().unwrap_or(0);
-        let (first, second): (Vec<_>, Vec<_>) = shown.into_iter().partition(|(_, block)| *block < middle);
-        [first, second].map(|half| half.into_iter().map(|(residual, _)| residual).collect())
-    }
-
-    /// Returns the residuals of joint positions with a fixed base, outside held-out blocks: number of the residual, log, joint
-    /// and row.
-    pub fn positions_in_air(&self) -> Vec<(usize, usize, usize, usize)> {
-        let experiments = self.experiments.iter().enumerate();
-        let rows =
-            experiments.flat_map(|(log, experiment)| experiment.residual_index().map(move |(_, row)| (log, row)));
-        let cells = self.cells.iter().zip(rows).enumerate();
-        let shown = cells.filter(|(_, ((channel, fold, _), _))| fold.is_some() && *channel < TORQUE);
-        shown.map(|(residual, ((channel, ..), (log, row)))| (residual, log, *channel, row)).collect()
     }
 
     /// Returns the standard deviation of noise and model error of a joint's position [rad].
@@ -173,52 +129,6 @@ impl ResidualRows {
             whole.iter_mut().zip(residuals).for_each(|(whole, residuals)| append(whole, residuals));
         }
         whole
-    }
-
-    /// Returns the residuals of each candidate after elimination of the nuisance parameters.
-    pub fn nuisance_corrected(&self, simulator: &mut dyn Rollout, robots: &[RobotModel]) -> Vec<Vec<f64>> {
-        let mut residuals = self.residuals(simulator, robots);
-        if let Some(tolerances) = &self.tolerances {
-            residuals.par_iter_mut().for_each(|residuals| tolerances.project_out(residuals));
-        }
-        residuals
-    }
-
-    /// Calls `each` with candidate, channel, block, residual of the first robot, and the difference of the candidate's
-    /// from it, both in units of noise and model error.
-    pub fn differences(
-        &self,
-        simulator: &mut dyn Rollout,
-        robot: &RobotModel,
-        candidates: &[RobotModel],
-        mut each: impl FnMut(usize, usize, usize, [f64; 2]),
-    ) {
-        let reference = self.nuisance_corrected(simulator, std::slice::from_ref(robot)).remove(0);
-        for (batch, candidates) in candidates.chunks(BATCH_SIZE).enumerate() {
-            for (index, residuals) in self.nuisance_corrected(simulator, candidates).iter().enumerate() {
-                let pairs = reference.iter().zip(residuals).zip(self.cells.iter().zip(&self.blocks));
-                for ((reference, residual), ((channel, fold, weight), block)) in pairs {
-                    if let (Some(_), Some(block)) = (fold, block) {
-                        let pair = [weight * reference, weight * (residual - reference)];
-                        each(batch * BATCH_SIZE + index, *channel, *block, pair);
-                    }
-                }
-            }
-        }
-    }
-
-    /// Returns the residuals of the first log in the two folds after elimination of the nuisance parameters, by channel and
-    /// row, in units of noise and model error; NaN where there is none.
-    pub fn tables(&self, simulator: &mut dyn Rollout, robot: &RobotModel, rows: usize) -> Vec<Vec<f64>> {
-        let mut tables = vec![vec![f64::NAN; rows]; CHANNELS];
-        let corrected = self.nuisance_corrected(simulator, std::slice::from_ref(robot)).remove(0);
-        let index = self.experiments[0].residual_index();
-        for (((_, row), residual), (channel, fold, weight)) in index.zip(corrected).zip(&self.cells) {
-            if fold.is_some() {
-                tables[*channel][row] = residual * weight;
-            }
-        }
-        tables
     }
 
     fn residual_power(&self, mut residuals: Vec<f64>) -> ResidualPower {

@@ -39,8 +39,7 @@ pub use nominal::{ControlTable, JointGains, JointsTable, KindGains, NominalRobot
 pub use parse_toml::parse_toml;
 pub use sampler::{RobotSampler, SamplingError};
 pub use scope::{Scope, UnknownScope};
-pub use search::{BlindTestCondition, Probes, Search, Variable, Visibility};
-use search::{probes_along_axes, probes_over};
+pub use search::{BlindTestCondition, Search, Variable, Visibility};
 pub use shipped_robots::shipped_robots;
 
 use twinstep_model::{JointModel, RobotModel};
@@ -200,21 +199,6 @@ impl Effect {
     /// Returns true if it replaces a body, so that effects that change the body are applied after it.
     pub fn replaces_body(&self) -> bool {
         self.composition == Composition::Replace && self.target == Target::Bodies
-    }
-
-    /// Returns the values of `probes`, from small to large.
-    pub fn probe_values(&self, probes: Probes) -> Vec<Vec<f64>> {
-        let first = &self.parameters[0];
-        match probes {
-            Probes::FirstParameter(others) => {
-                let [least, most] = first.bounds;
-                let values = probes_over(first.prior_range, first.no_effect_value);
-                let values = values.into_iter().map(|value| value.clamp(least, most));
-                values.flat_map(|value| others.iter().map(move |others| [&[value], *others].concat())).collect()
-            }
-            Probes::Values(values) => values(),
-            Probes::None => Vec::new(),
-        }
     }
 
     /// Returns true if values add up to a sum that cannot be negative, so that an entry may take away what a robot's file states.

@@ -37,20 +37,6 @@ fn names_are_unique_and_confounders_are_in_the_catalogue() {
     }
 }
 
-#[test]
-fn probes_are_allowed_values_and_every_effect_but_one_has_some() {
-    for effect in CATALOGUE {
-        let probes = [effect.search.probes, effect.search.whole_log_probes].map(|probes| effect.probe_values(probes));
-        for values in probes.iter().flatten() {
-            EffectEntry::new(effect, some_scope(effect), values.clone()).expect(effect.name);
-        }
-        let count = probes.concat().len();
-        assert_eq!(count == 0, effect.name == "inertia", "{} has {count} probes", effect.name);
-        // The scan of joints evaluates each joint alone, which effects on base and ground do not allow.
-        assert!(probes[0].is_empty() || matches!(effect.target, Target::Joints | Target::Supply), "{}", effect.name);
-    }
-}
-
 /// Sets the parameters of effects that are switched off to those of the nominal robot.
 fn without_inactive_parameters(mut robot: RobotModel) -> RobotModel {
     let nominal = go2();

@@ -192,21 +192,6 @@ impl NuisanceModel {
         Self::of(self.starts.par_iter().map(|start| start.rescaled(spread)).collect::<Option<_>>()?, jacobian)
     }
 
-    /// Returns the effect of each error of the robot, of one standard deviation, on residuals divided by `spread`.
-    ///
-    /// The nuisance parameters of `taken` are eliminated from the effects.
-    pub fn robot_errors(&self, spread: &[f64], taken: Option<&Self>) -> Vec<Vec<f64>> {
-        let error = |jacobian: nalgebra::DVectorView<f64>| {
-            let mut residuals: Vec<f64> =
-                jacobian.iter().zip(spread).map(|(derivative, spread)| derivative / spread).collect();
-            if let Some(taken) = taken {
-                taken.project_out(&mut residuals);
-            }
-            residuals
-        };
-        self.jacobian.column_iter().map(|column| error(column.as_view())).collect()
-    }
-
     /// Eliminates all nuisance parameters from the residuals, and appends their penalties.
     ///
     /// The sum of squares of the result is the generalised least-squares cost, if no parameter is larger than [`LARGEST`].

@@ -110,7 +110,7 @@ fn of_quadruped(options: &DiagnoseOptions, logs: &[Log], observer: &Observer) ->
     let robot = model.robot_model().map_err(input)?;
     let mut simulator = simulator(&robot)?;
     let (output, learned) = with_progress(observer, |progress, stop| {
-        let output = search_causes(logs.to_vec(), &model, &mut simulator, &stop, progress).map_err(failure)?;
+        let output = search_causes(logs, &model, &mut simulator, &stop, progress).map_err(failure)?;
         // What was found must not be lost with the networks.
         let learned = match learned_residual::learn(logs, &output, progress) {
             Err(Failure::Input(error) | Failure::Other(error)) => {

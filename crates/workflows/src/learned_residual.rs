@@ -67,7 +67,7 @@ pub fn learn(
     let masks: Vec<&[bool]> = output.held_out.iter().map(Vec::as_slice).collect();
     let mut best: Option<(f64, Tap, LearnedResidual)> = None;
     for tap in [Tap::Sensor, Tap::Output] {
-        let model = &output.before_last_fit;
+        let model = &output.extended;
         let Some(data) = data_set(logs, model, tap, &masks, false)? else { continue };
         let before = output.diagnosis.extended;
         let Some(q_before) = before.q_rmse_rad else { continue };

@@ -4,7 +4,7 @@ use glam::DVec3;
 
 use crate::{
     Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place,
-    PlotQuantity, Probes, Search, Target, Variable, Visibility, demo, probes_along_axes,
+    PlotQuantity, Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -36,12 +36,7 @@ pub const EFFECT: Effect = Effect {
     recommended: &[DataRequirement::Orientation, DataRequirement::TorqueMeasured],
     caveat: "",
     remedy: "Change a number: move the centre of mass of this link in the simulator, or check what is mounted on it.",
-    search: Search {
-        probes: Probes::None,
-        whole_log_probes: Probes::Values(|| probes_along_axes(0.05)),
-        min_share: 0.15,
-        ..Search::DEFAULT
-    },
+    search: Search::DEFAULT,
     visibility: Visibility::Position,
     explained_by: Variable::Time,
     demo: EffectDemo {

@@ -44,7 +44,7 @@ pub const EFFECT: Effect = Effect {
     recommended: &[DataRequirement::Bandwidth(2.0)],
     caveat: "confounded with armature in slow motion",
     remedy: "Add the law: delay commands in the simulator by this time. Or shorten the path from controller to motor.",
-    search: Search { oscillates: true, ..Search::DEFAULT },
+    search: Search::DEFAULT,
     visibility: Visibility::MotorTorque,
     explained_by: Variable::CommandRate,
     demo: EffectDemo {

@@ -42,7 +42,7 @@ pub const EFFECT: Effect = Effect {
     recommended: &[DataRequirement::TorqueMeasured],
     caveat: "its gain falls with frequency, that of a delay does not",
     remedy: "Add the law: a first-order lag between commanded and actual torque. Or raise the current loop's bandwidth.",
-    search: Search { oscillates: true, ..Search::DEFAULT },
+    search: Search::DEFAULT,
     visibility: Visibility::MotorTorque,
     explained_by: Variable::CommandedTorqueRate,
     demo: EffectDemo {

@@ -2,7 +2,7 @@
 
 use crate::{
     Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place,
-    PlotQuantity, Presence, Probes, Search, Target, Variable, Visibility, demo,
+    PlotQuantity, Presence, Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -39,11 +39,7 @@ pub const EFFECT: Effect = Effect {
     recommended: &[DataRequirement::KpVaries],
     caveat: "confounded with a constant load at a single kp",
     remedy: "Mend the robot: calibrate the zero of these encoders. Or subtract the offset from the readings.",
-    search: Search {
-        whole_log_probes: Probes::Values(|| vec![vec![-0.02], vec![0.02]]),
-        min_share: 0.45,
-        ..Search::DEFAULT
-    },
+    search: Search::DEFAULT,
     visibility: Visibility::MotorTorque,
     explained_by: Variable::Position,
     demo: EffectDemo {

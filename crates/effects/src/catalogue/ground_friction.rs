@@ -1,8 +1,8 @@
 //! Friction coefficient of the ground.
 
 use crate::{
-    Apply, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Probes, Search,
-    Target, Variable, Visibility, demo,
+    Apply, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Search, Target,
+    Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -30,11 +30,7 @@ pub const EFFECT: Effect = Effect {
     recommended: &[DataRequirement::BasePose],
     caveat: "only slipping feet determine its value",
     remedy: "Change a number: set the friction coefficient of the ground in the simulator.",
-    search: Search {
-        probes: Probes::None,
-        whole_log_probes: Probes::Values(|| [0.3, 0.5, 0.65, 1.1].map(|friction| vec![friction]).to_vec()),
-        ..Search::DEFAULT
-    },
+    search: Search::DEFAULT,
     visibility: Visibility::Position,
     explained_by: Variable::Time,
     demo: EffectDemo {

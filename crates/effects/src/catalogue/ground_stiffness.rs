@@ -2,7 +2,7 @@
 
 use crate::{
     Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
-    Probes, Search, Target, Variable, Visibility, demo,
+    Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -32,12 +32,7 @@ pub const EFFECT: Effect = Effect {
     recommended: &[DataRequirement::FootContact],
     caveat: "",
     remedy: "Change a number: set the time constant of contacts (`solref` in MJCF) in the simulator.",
-    search: Search {
-        probes: Probes::None,
-        whole_log_probes: Probes::Values(|| [0.005, 0.01, 0.02, 0.04].map(|time| vec![time]).to_vec()),
-        min_share: 0.3,
-        ..Search::DEFAULT
-    },
+    search: Search::DEFAULT,
     visibility: Visibility::Position,
     explained_by: Variable::Time,
     demo: EffectDemo {

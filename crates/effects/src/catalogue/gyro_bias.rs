@@ -4,7 +4,7 @@ use glam::DVec3;
 
 use crate::{
     Apply, BlindTestCondition, Composition, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place,
-    PlotQuantity, Probes, Search, Target, Variable, Visibility, demo, probes_along_axes,
+    PlotQuantity, Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -29,11 +29,7 @@ pub const EFFECT: Effect = Effect {
     recommended: &[DataRequirement::Orientation],
     caveat: "",
     remedy: "Retune the robot: average the gyroscope at rest and subtract the bias.",
-    search: Search {
-        probes: Probes::None,
-        whole_log_probes: Probes::Values(|| probes_along_axes(0.02)),
-        ..Search::DEFAULT
-    },
+    search: Search::DEFAULT,
     visibility: Visibility::Position,
     explained_by: Variable::Time,
     demo: EffectDemo {

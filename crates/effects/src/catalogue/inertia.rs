@@ -2,7 +2,7 @@
 
 use crate::{
     Apply, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place, PlotQuantity,
-    Probes, Search, Target, Variable, Visibility, demo,
+    Search, Target, Variable, Visibility, demo,
 };
 use twinstep_model::RigidBody;
 
@@ -38,7 +38,7 @@ pub const EFFECT: Effect = Effect {
     recommended: &[DataRequirement::Orientation],
     caveat: "",
     remedy: "Change a number: set the mass, centre of mass and inertia of this link in the simulator.",
-    search: Search { probes: Probes::None, ..Search::DEFAULT },
+    search: Search::DEFAULT,
     visibility: Visibility::Position,
     explained_by: Variable::Time,
     demo: EffectDemo {

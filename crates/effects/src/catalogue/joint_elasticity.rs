@@ -38,7 +38,7 @@ pub const EFFECT: Effect = Effect {
     caveat: "",
     remedy: "Add the law: a spring between rotor and link. One joint alone: check its mounting and its gear.",
     // Other contact laws, and legs that bend, imitate small values.
-    search: Search { min_share: 0.15, ..Search::DEFAULT },
+    search: Search::DEFAULT,
     visibility: Visibility::Position,
     explained_by: Variable::CommandedTorque,
     demo: EffectDemo {

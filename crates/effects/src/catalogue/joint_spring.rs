@@ -2,7 +2,7 @@
 
 use crate::{
     Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place,
-    PlotQuantity, Presence, Probes, Search, Target, Variable, Visibility, demo,
+    PlotQuantity, Presence, Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -49,7 +49,7 @@ pub const EFFECT: Effect = Effect {
     recommended: &[DataRequirement::TorqueMeasured],
     caveat: "",
     remedy: "Add the law: a spring at these joints (`stiffness` and `springref` in MJCF). Or reroute the cable that pulls.",
-    search: Search { probes: Probes::FirstParameter(&[&[-1.2], &[0.0], &[1.2]]), ..Search::DEFAULT },
+    search: Search::DEFAULT,
     visibility: Visibility::LinkTorque,
     explained_by: Variable::Position,
     demo: EffectDemo {

@@ -4,7 +4,7 @@ use glam::DVec3;
 
 use crate::{
     Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place,
-    PlotQuantity, Probes, Search, Target, Variable, Visibility, demo,
+    PlotQuantity, Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -50,11 +50,7 @@ pub const EFFECT: Effect = Effect {
     recommended: &[DataRequirement::TorqueMeasured],
     caveat: "a load on a leg is also identifiable with a fixed base",
     remedy: "Change a number: add this mass at this position in the simulator, or remove it from the robot.",
-    search: Search {
-        probes: Probes::None,
-        whole_log_probes: Probes::Values(|| [-0.5, 0.3, 0.8, 2.0].map(|mass| vec![mass, 0.0, 0.0, 0.0]).to_vec()),
-        ..Search::DEFAULT
-    },
+    search: Search::DEFAULT,
     visibility: Visibility::Position,
     explained_by: Variable::Time,
     demo: EffectDemo {

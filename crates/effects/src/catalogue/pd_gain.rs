@@ -2,7 +2,7 @@
 
 use crate::{
     Apply, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place, PlotQuantity,
-    Presence, Probes, Search, Target, Variable, Visibility, demo, probes_over,
+    Presence, Search, Target, Variable, Visibility, demo,
 };
 
 /// Prior range of the factor on kp.
@@ -57,7 +57,7 @@ pub const EFFECT: Effect = Effect {
     recommended: &[DataRequirement::KdVaries],
     caveat: "",
     remedy: "Retune the robot: set the gains that the log states, or state the gains that the motors have.",
-    search: Search { probes: Probes::Values(probes), ..Search::DEFAULT },
+    search: Search::DEFAULT,
     visibility: Visibility::MotorTorque,
     explained_by: Variable::CommandedTorque,
     demo: EffectDemo {
@@ -82,9 +82,3 @@ pub const EFFECT: Effect = Effect {
         Ok(())
     }),
 };
-
-/// Returns scales of one gain at a time, from small to large changes.
-fn probes() -> Vec<Vec<f64>> {
-    let kp = probes_over(KP_RANGE, 1.0).into_iter().map(|scale| vec![scale, 1.0]);
-    kp.chain(probes_over(KD_RANGE, 1.0).into_iter().map(|scale| vec![1.0, scale])).collect()
-}

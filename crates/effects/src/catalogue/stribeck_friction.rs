@@ -2,7 +2,7 @@
 
 use crate::{
     Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place,
-    PlotQuantity, Probes, Search, Shapes, Target, Variable, Visibility, demo,
+    PlotQuantity, Search, Shapes, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -41,7 +41,7 @@ pub const EFFECT: Effect = Effect {
     recommended: &[DataRequirement::TorqueMeasured],
     caveat: "",
     remedy: "Add the law: friction that falls with speed at these joints. Slow motion needs it.",
-    search: Search { probes: Probes::FirstParameter(&[&[0.15], &[0.6], &[2.0]]), ..Search::DEFAULT },
+    search: Search::DEFAULT,
     visibility: Visibility::OutputTorque,
     explained_by: Variable::Velocity,
     demo: EffectDemo {

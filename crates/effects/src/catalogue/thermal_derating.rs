@@ -2,7 +2,7 @@
 
 use crate::{
     Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, EffectSite, LawForm,
-    Parameter, Place, PlotQuantity, Probes, Search, Shapes, Target, Variable, Visibility, demo,
+    Parameter, Place, PlotQuantity, Search, Shapes, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -48,7 +48,7 @@ pub const EFFECT: Effect = Effect {
     recommended: &[DataRequirement::TorqueMeasured],
     caveat: "",
     remedy: "Retune the robot: cool the motors or lower their load. Or add the law to the simulator.",
-    search: Search { probes: Probes::FirstParameter(&[&[35.0]]), predictable: false, ..Search::DEFAULT },
+    search: Search { predictable: false, ..Search::DEFAULT },
     visibility: Visibility::MotorTorque,
     explained_by: Variable::Temperature,
     demo: EffectDemo {

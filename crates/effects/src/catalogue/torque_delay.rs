@@ -42,7 +42,7 @@ pub const EFFECT: Effect = Effect {
     recommended: &[DataRequirement::Bandwidth(2.0), DataRequirement::TorqueMeasured],
     caveat: "differs from command_delay only if the joint is pushed",
     remedy: "Add the law: delay the torque of the whole loop in the simulator. Or raise the rate of the control loop.",
-    search: Search { oscillates: true, ..Search::DEFAULT },
+    search: Search::DEFAULT,
     visibility: Visibility::MotorTorque,
     explained_by: Variable::CommandedTorqueRate,
     demo: EffectDemo {

@@ -4,7 +4,7 @@ use std::f64::consts::PI;
 
 use crate::{
     Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place,
-    PlotQuantity, Probes, Search, Shapes, Target, Variable, Visibility, demo,
+    PlotQuantity, Search, Shapes, Target, Variable, Visibility, demo,
 };
 use twinstep_model::Ripple;
 
@@ -54,7 +54,7 @@ pub const EFFECT: Effect = Effect {
     caveat: "",
     remedy: "Mend the robot: calibrate the commutation of the motor. Or add the law to the simulator.",
     // A tenth of the standard deviation of the number of cycles would turn the phase by half a period.
-    search: Search { probes: Probes::Values(probes), near, derivative_step: 0.01, ..Search::DEFAULT },
+    search: Search { derivative_step: 0.01, ..Search::DEFAULT },
     visibility: Visibility::OutputTorque,
     explained_by: Variable::Position,
     demo: EffectDemo {
@@ -86,34 +86,8 @@ pub const EFFECT: Effect = Effect {
     }),
 };
 
-/// Distance of the numbers of cycles of two probes.
-const STEP: u32 = 3;
-
-/// Returns ripples of one amplitude, with every third number of cycles and four phases.
-fn probes() -> Vec<Vec<f64>> {
-    let phases = [0.0, 0.5, 1.0, -0.5].map(|turn| turn * PI);
-    (7..=150)
-        .step_by(STEP as usize)
-        .flat_map(|cycles| phases.map(|phase| vec![0.12, f64::from(cycles), phase]))
-        .collect()
-}
-
-/// Returns ripples up to a step of the probes away, with eight phases and two amplitudes.
-///
-/// Joints move within 0.5 rad of their mean position. There the phase error to the nearest of them is at most 0.52 rad, to the
-/// nearest probe 1.5 rad, from which a fit may end in another minimum.
-fn near(values: &[f64]) -> Vec<Vec<f64>> {
-    let [least, most] = EFFECT.parameters[1].bounds;
-    let cycles = (-6..=6).map(|step| (values[1] + f64::from(step) * f64::from(STEP) / 6.0).clamp(least, most));
-    let phases = (-3..=4).map(|eighth| f64::from(eighth) * PI / 4.0);
-    let ripples = cycles.flat_map(|cycles| phases.clone().map(move |phase| [cycles, phase]));
-    ripples.flat_map(|[cycles, phase]| [0.12, 0.3].map(|amplitude| vec![amplitude, cycles, phase])).collect()
-}
-
 #[cfg(test)]
 mod tests {
-    use proptest::prelude::*;
-
     use super::*;
 
     /// Derivatives over half a period have the wrong sign.
@@ -122,20 +96,5 @@ mod tests {
         let [low, high] = EFFECT.parameters[1].prior_range;
         let step = EFFECT.search.derivative_step * (high - low) / (2.0 * 1.96);
         assert!(step * 1.3 < 0.5, "{step} cycles per revolution at 1.3 rad");
-    }
-
-    proptest! {
-        /// The fit starts within a quarter of a period of the truth everywhere in the motion.
-        #[test]
-        fn one_of_the_ripples_near_the_next_probe_is_in_phase(
-            probe in 7u32..=150, offset in -1.5f64..1.5, phase in -PI..PI, mean_q in -2.5f64..2.5, q in -0.5f64..0.5,
-        ) {
-            let truth = |q: f64| (f64::from(probe) + offset) * q + phase;
-            let error = |values: &[f64], q: f64| (values[1] * q + values[2] - truth(q) + PI).rem_euclid(2.0 * PI) - PI;
-            let near = near(&[0.12, f64::from(probe), 0.0]);
-            let best = near.iter().map(|values| error(values, mean_q).abs() + 0.5 * (values[1] - f64::from(probe) - offset).abs());
-            let values = near.iter().zip(best).min_by(|one, other| one.1.total_cmp(&other.1)).expect("some").0;
-            prop_assert!(error(values, mean_q + q).abs() < 0.52, "{values:?}");
-        }
     }
 }

@@ -122,20 +122,6 @@ impl Experiment {
         self
     }
 
-    /// Returns the experiment restricted to windows with a fixed base.
-    #[must_use]
-    pub fn only_fixed_base(mut self) -> Self {
-        self.windows.retain(|window| window.base.is_fixed());
-        self
-    }
-
-    /// Returns the first row of each window, from whose measured state its simulation starts, in order.
-    pub fn window_starts(&self) -> Vec<usize> {
-        let mut starts: Vec<usize> = self.windows.iter().map(|window| window.rows.start).collect();
-        starts.sort_unstable();
-        starts
-    }
-
     /// Returns true if a window has a fixed base.
     pub fn has_fixed_base(&self) -> bool {
         self.windows.iter().any(|window| window.base.is_fixed())
