@@ -31,10 +31,9 @@ const SWING_HEIGHT: f64 = 0.02;
 const MEASURED_ACCELERATION_DENSITY: f64 = 0.1;
 /// Spectral density of the accelerations of a robot without an accelerometer [m²/s³].
 const UNKNOWN_ACCELERATION_DENSITY: f64 = 5.0;
-/// Share of a foot's highest force below which it is in the air; feet that never fall below it always stand.
+
+/// Share of a foot's highest force below which it may slip.
 const CONTACT_SHARE: f64 = 0.15;
-/// Share of a foot's highest force up to which its lowest one is that of a foot in the air.
-const MAX_OFFSET_SHARE: f64 = 0.5;
 
 /// Estimated position and velocity of the base in the world frame.
 #[derive(Clone, Debug)]
@@ -114,7 +113,7 @@ fn measurements(log: &Log, robot: &RobotModel) -> Vec<RowMeasurement> {
         (q, log.dq(joint.name()).map_or_else(|| derivative(log, q), <[f64]>::to_vec))
     });
     let finite = |cell: f64| if cell.is_finite() { cell } else { 0.0 };
-    let contacts = Leg::ALL.map(|leg| contacts(log, leg));
+    let contacts = Leg::ALL.map(|leg| log.contacts(&format!("{leg:?}"), CONTACT_SHARE));
     let of_row = |row: usize| {
         let mut q = robot.control.default_pose_f32();
         let mut dq = [0.0; NUM_JOINTS];
@@ -148,24 +147,6 @@ fn measurements(log: &Log, robot: &RobotModel) -> Vec<RowMeasurement> {
         RowMeasurement { feet, acceleration: acceleration.or(falls.then_some(GRAVITY)) }
     };
     (0..log.rows()).map(of_row).collect()
-}
-
-/// Returns whether a foot stands in each row, from `contact` or `foot_force`; `None` if the log has neither, or zeros.
-fn contacts(log: &Log, leg: Leg) -> Option<Vec<Option<bool>>> {
-    let known = |cells: &[f64], threshold: f64| -> Vec<Option<bool>> {
-        cells.iter().map(|cell| cell.is_finite().then_some(*cell > threshold)).collect()
-    };
-    if let Some(cells) = log.channel(&format!("contact_{leg:?}")).filter(|cells| cells.iter().any(|cell| *cell > 0.5)) {
-        return Some(known(cells, 0.5));
-    }
-    let forces = log.channel(&format!("foot_force_{leg:?}"))?;
-    let mut sorted: Vec<f64> = forces.iter().copied().filter(|force| force.is_finite()).collect();
-    sorted.sort_by(f64::total_cmp);
-    let quantile = |share: f64| sorted.get((sorted.len().saturating_sub(1) as f64 * share) as usize).copied();
-    let (low, high) = (quantile(0.05)?, quantile(0.9).filter(|force| *force > 0.0)?);
-    // Raw counts of a robot have an offset: those of a foot in the air. The force of a foot that always stands varies less.
-    let offset = if low < MAX_OFFSET_SHARE * high { low } else { 0.0 };
-    Some(known(forces, offset + CONTACT_SHARE * (high - offset)))
 }
 
 /// Returns central differences of `cells` within contiguous ranges of rows.

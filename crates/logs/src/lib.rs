@@ -34,6 +34,7 @@
 mod check;
 mod column_map;
 mod columns;
+mod contacts;
 mod csv_table;
 mod describe;
 mod describe_text;

@@ -199,6 +199,21 @@ impl Log {
         self
     }
 
+    /// Returns the log with the torque of each row in the row before, because a message cannot contain the torque of the time after it. The
+    /// last row of a range has none.
+    #[must_use]
+    pub(crate) fn with_torques_before_messages(mut self) -> Self {
+        let ranges: Vec<Range<usize>> = self.segments().map(|(_, rows)| rows).collect();
+        let torques = self.channels.iter_mut().filter(|(name, _)| name.starts_with("tau_measured_"));
+        for (_, cells) in torques {
+            for rows in &ranges {
+                cells[rows.clone()].rotate_left(1);
+                cells[rows.end - 1] = f64::NAN;
+            }
+        }
+        self
+    }
+
     /// Joins logs of one robot: their segments follow each other, 10 s apart. Positions, velocities, torques, temperatures and voltage that one of them
     /// lacks are left out. Other sensors have no reading where they are missing, and commands of velocity and torque are 0.
     ///

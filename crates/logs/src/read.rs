@@ -59,6 +59,7 @@ fn read(path: &Path, need: LogKind, map: &ColumnMap) -> Result<Log, LogError> {
         meta.ok_or_else(|| LogError::NoMeta { expected: files.expected_meta(), data: files.data.clone() })
     };
     let open = || std::fs::File::open(&files.data).map_err(|cause| LogError::Read { file: files.data.clone(), cause });
+    let mut is_recording = false;
     let (mut table, meta) = match files.format {
         Format::Csv => (csv_table::read(&files.data, open()?, map)?, needed(meta)?),
         Format::CsvGz => {
@@ -71,7 +72,9 @@ fn read(path: &Path, need: LogKind, map: &ColumnMap) -> Result<Log, LogError> {
         Format::Parquet => (parquet_table::read(&files.data, map)?, needed(meta)?),
         Format::Mcap => {
             let parts = [std::slice::from_ref(&files.data), &files.more].concat();
-            mcap_file::read(&parts, meta, need != LogKind::States)?
+            let (table, meta, is_written) = mcap_file::read(&parts, meta, need != LogKind::States)?;
+            is_recording = !is_written;
+            (table, meta)
         }
     };
     table.notes.extend(
@@ -79,7 +82,9 @@ fn read(path: &Path, need: LogKind, map: &ColumnMap) -> Result<Log, LogError> {
             format!("unknown key `{key}` of the meta file is ignored; the known keys are {}", KEYS.join(", "))
         }),
     );
-    check::assemble(table, meta, meta_file, need)
+    let log = check::assemble(table, meta, meta_file, need)?;
+    // A torque that repeats is taken as known at the times of its messages.
+    Ok(if is_recording && log.repeats().is_none() { log.with_torques_before_messages() } else { log })
 }
 
 fn from_columns(

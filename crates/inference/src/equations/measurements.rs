@@ -201,7 +201,8 @@ fn base_rows(log: &Log, t: &[f64], ranges: &[Range<usize>]) -> Option<BaseRows> 
         let noise = log.noise(names[axis]).filter(|noise| *noise > 0.0);
         let noise = noise.map_or((GYRO_NOISE, false), |noise| (noise, true));
         let readings: Vec<f64> = gyro.iter().map(|reading| reading[axis]).collect();
-        let [smooth, _] = smoothed(t, [&readings, &vec![f64::NAN; t.len()]], [noise, (1.0, true)], ranges);
+        // An impact changes a rate as it changes the velocity of a joint; the angle is not read.
+        let [_, smooth] = smoothed(t, [&vec![f64::NAN; t.len()], &readings], [(1.0, true), noise], ranges);
         smooth
     };
     let smooth = [0, 1, 2].map(smooth);
@@ -214,18 +215,9 @@ fn base_rows(log: &Log, t: &[f64], ranges: &[Range<usize>]) -> Option<BaseRows> 
     })
 }
 
+/// Returns whether each foot touches the ground by row; empty if the log does not tell it of all feet.
 fn contact_rows(log: &Log, robot: &Robot) -> Vec<Vec<Option<bool>>> {
-    // A force within its noise is none; without a stated noise any force may be one.
-    let noise = |foot: &str| log.noise(&format!("foot_force_{foot}")).filter(|noise| *noise > 0.0);
-    let of = |foot: &str| -> Option<(&[f64], f64)> {
-        let of_force = || Some((log.channel(&format!("foot_force_{foot}"))?, 3.0 * noise(foot)?));
-        log.channel(&format!("contact_{foot}")).map(|cells| (cells, 0.5)).or_else(of_force)
-    };
-    let channels: Option<Vec<_>> = robot.feet.iter().map(|foot| of(&foot.name)).collect();
-    let touches = |(cells, least): (&[f64], f64)| {
-        cells.iter().map(|cell| cell.is_finite().then_some(*cell > least)).collect::<Vec<_>>()
-    };
-    channels.map_or(Vec::new(), |all| all.into_iter().map(touches).collect())
+    robot.feet.iter().map(|foot| log.contacts(&foot.name, 0.0)).collect::<Option<_>>().unwrap_or_default()
 }
 
 fn split_at_gaps(t: &[f64], range: Range<usize>) -> Vec<Range<usize>> {

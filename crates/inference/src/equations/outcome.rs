@@ -97,7 +97,7 @@ impl<R: Residuals> Search<'_, R> {
         let unknown = self.unknown_laws(&best);
         Found {
             // What joints have a little of has their gains.
-            gains: if little.is_empty() { self.gains(&best) } else { Vec::new() },
+            gains: if little.is_empty() { Self::gains(&best) } else { Vec::new() },
             causes,
             little,
             left,
@@ -110,7 +110,7 @@ impl<R: Residuals> Search<'_, R> {
     /// Returns the scales of position and velocity gain by joint, if joints that differ are more likely than equal ones; else none.
     ///
     /// By how much the gains of a robot differ is not known before: it is what is most likely, from the usual to all that is no cause.
-    fn gains(&self, best: &Fitted<R>) -> Vec<[f64; 2]> {
+    fn gains(best: &Fitted<R>) -> Vec<[f64; 2]> {
         let of_gains = || best.small.groups.iter().filter(|group| group.gain.is_some());
         if of_gains().next().is_none() {
             return Vec::new();

@@ -16,6 +16,8 @@ pub struct Robot {
     pub scale: Vec<f64>,
     /// Feet.
     pub feet: Vec<Foot>,
+    /// The other parts that may touch the ground.
+    pub other_parts: Vec<Sphere>,
     /// Exponent n of the supply law `τ (V / V_ref)ⁿ`.
     pub voltage_exponent: f64,
     /// Loss of torque [1/K] above a temperature [°C], by joint.
@@ -26,6 +28,39 @@ pub struct Robot {
     pub ground_friction: f64,
     /// Time constant of the contact with the ground [s].
     pub contact_time: f64,
+}
+
+/// Sphere that moves with a body, or a point.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Sphere {
+    /// Index of the body.
+    pub body: usize,
+    /// Centre in the frame of the body [m].
+    pub centre: DVec3,
+    /// Radius [m]; zero for a point.
+    pub radius: f64,
+}
+
+impl From<&Foot> for Sphere {
+    fn from(foot: &Foot) -> Self {
+        Self { body: foot.body, centre: foot.centre, radius: foot.radius }
+    }
+}
+
+/// Returns the corners of the boxes of trunk and thighs, and the knees.
+fn other_parts(robot: &RobotModel) -> Vec<Sphere> {
+    let shapes = &robot.shapes;
+    let signs = || [1.0, -1.0].into_iter();
+    let corners = |body: usize, centre: DVec3, half: DVec3| {
+        let corners = signs().flat_map(|x| signs().flat_map(move |y| signs().map(move |z| DVec3::new(x, y, z))));
+        corners.map(move |corner| Sphere { body, centre: centre + corner * half, radius: 0.0 })
+    };
+    let of_leg = |leg: usize| {
+        // The body of a joint follows the base and the bodies of the joints before.
+        let knee = Sphere { body: 3 * leg + 3, centre: shapes.calf_ends[0], radius: shapes.calf_radius };
+        corners(3 * leg + 2, shapes.thigh_centre, shapes.thigh_half_size).chain([knee])
+    };
+    corners(0, DVec3::ZERO, shapes.trunk_half_size).chain((0..robot.legs.len()).flat_map(of_leg)).collect()
 }
 
 impl Robot {
@@ -45,6 +80,7 @@ impl From<&RobotModel> for Robot {
             joints: robot.joints.to_vec(),
             scale: vec![1.0; robot.joints.len()],
             feet: Feet::from(robot).feet().to_vec(),
+            other_parts: other_parts(robot),
             voltage_exponent: derating.voltage_exponent,
             thermal: derating
                 .per_kelvin
@@ -72,6 +108,7 @@ impl From<&TreeModel> for Robot {
             joints: robot.joints.clone(),
             scale: JointScale::of(robot).iter().map(|scale| scale.torque / OF_GO2).collect(),
             feet: Vec::new(),
+            other_parts: Vec::new(),
             voltage_exponent: 0.0,
             thermal: vec![[0.0; 2]; robot.joints.len()],
             gyro_bias: DVec3::ZERO,

@@ -3,9 +3,9 @@
 use std::ops::Range;
 use std::sync::Arc;
 
-use glam::{DMat3, DQuat, DVec3};
+use glam::{DQuat, DVec3};
 use twinstep_dynamics::Vec3;
-use twinstep_dynamics::tree::{TreeMotion, TreeParameters, TreeState, TreeStructure};
+use twinstep_dynamics::tree::{TreeParameters, TreeState, TreeStructure};
 
 use super::drive::{inverse, link_torque};
 use super::measurements::{JointRows, Measurements, Regime};
@@ -23,8 +23,6 @@ const LEAST_SPEED: f64 = 0.05;
 /// With these rows the height of a payload came out 0.5 m too low, on a robot with dry friction. The likely reason is that the law of
 /// friction has none at rest, where it is not determined; then this is a stand-in for friction at rest as an unknown.
 const SETTLING_S: f64 = 1.5;
-/// Time before and after a sample in which no foot touches down or lifts off [s].
-const SETTLED_S: f64 = 0.02;
 
 /// Motion in a sample.
 #[derive(Clone, Debug)]
@@ -295,62 +293,4 @@ fn base_motion(measured: &Measurements, rows: &Range<usize>, regime: Regime, of:
         BaseMotion { angular_velocity, angular_acceleration, linear_acceleration: of_columns, ..turned[1] };
     let numbers = response.angular_velocity.iter().chain(&response.angular_acceleration);
     numbers.chain(&response.linear_acceleration).copied().all(f64::is_finite).then_some([response, instrument])
-}
-
-impl Sample {
-    /// Computes the force at the base per torque of a joint. Returns false if it is not known which feet stand, or they are not at the end
-    /// of three joints.
-    fn set_feet(
-        &mut self,
-        measured: &Measurements,
-        robot: &Robot,
-        structure: &TreeStructure,
-        bodies: &TreeParameters<f64>,
-    ) -> bool {
-        let settled = (SETTLED_S / measured.dt).round() as usize;
-        let rows = self.rows.start.saturating_sub(settled)..(self.rows.end + settled).min(measured.t.len());
-        let is_measured = measured.contact.iter().any(|touches| touches[rows.clone()].iter().any(Option::is_some));
-        let stands = |foot: usize| match measured.contact.get(foot).filter(|_| is_measured) {
-            Some(touches) => {
-                let first = touches[rows.start]?;
-                touches[rows.clone()].iter().all(|now| *now == Some(first)).then_some(first)
-            }
-            None => (self.regime == Regime::Stand).then_some(true),
-        };
-        let standing: Option<Vec<bool>> = (0..robot.feet.len()).map(stands).collect();
-        let Some(standing) = standing else { return false };
-        let state = self.state(robot, &self.response, [0.0; 3]);
-        let mut places = TreeMotion::empty(bodies);
-        places.set(bodies, &state, GRAVITY);
-        let turns = twinstep_dynamics::tree::batch_from_bodies(&robot.tree);
-        self.base_per_torque = vec![[0.0; 6]; robot.joints.len()];
-        for (foot, _) in robot.feet.iter().zip(standing).filter(|(_, stands)| *stands) {
-            let branch = &structure.branches[foot.body];
-            if branch.len() != 3 {
-                return false;
-            }
-            let place = &places.bodies[foot.body].place;
-            let centre = Vec3((turns[foot.body] * foot.centre).to_array());
-            let down = state.world_axes()[2].scaled(-foot.radius);
-            let contact = place.origin + place.turned(centre) + down;
-            let column = |joint: &usize| {
-                let axis = &places.bodies[joint + 1].axis;
-                DVec3::from_array((axis.linear + axis.angular.cross(contact)).0)
-            };
-            let [a, b, c] = [0, 1, 2].map(|index| column(&branch[index]));
-            // Jᵀ f = τ.
-            let jacobian = DMat3::from_cols(a, b, c);
-            if jacobian.determinant().abs() < 1e-4 {
-                return false;
-            }
-            let force_per_torque = jacobian.transpose().inverse();
-            for (index, joint) in branch.iter().enumerate() {
-                let force = force_per_torque.col(index);
-                let moment = DVec3::from_array(contact.0).cross(force);
-                self.is_free[*joint] = false;
-                self.base_per_torque[*joint] = [moment.x, moment.y, moment.z, force.x, force.y, force.z];
-            }
-        }
-        true
-    }
 }

@@ -39,6 +39,8 @@ impl<R: Residuals> Search<'_, R> {
             best = self.with_rivals(best, go_on)?;
         }
         best = self.without_imitations(best);
+        // What is left may explain what another cause seemed to.
+        best = self.without_surplus(best);
         Some(self.found(best, &given))
     }
 

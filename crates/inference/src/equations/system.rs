@@ -188,8 +188,11 @@ impl System {
         match (law.form.place, site) {
             (Place::Drive | Place::Supply, Site::Joint(joint)) => self.drive_column(joint, predicted, after),
             (Place::Supply, Site::Base) => {
-                let columns = (0..robot.joints.len()).map(|joint| self.drive_column(joint, predicted, after));
-                Column { parts: columns.flat_map(|column| column.parts).collect() }
+                let mut column = Column::default();
+                for joint in 0..robot.joints.len() {
+                    column.add(&self.drive_column(joint, predicted, after));
+                }
+                column
             }
             (Place::Joint, Site::Joint(joint)) if self.measured.is_at_output => {
                 self.drive_column(joint, predicted, after)
@@ -204,7 +207,7 @@ impl System {
                         - sample.link_torque(robot, joint, predicted.motor[joint][index])
                 };
                 let changes: Vec<f64> = moved.iter().enumerate().map(change).collect();
-                column.parts.extend(self.balance.joint_column(joint, &changes).parts);
+                column.add(&self.balance.joint_column(joint, &changes));
                 column
             }
             (Place::Link, Site::Joint(joint)) => {

@@ -14,10 +14,15 @@ use crate::go2_message::LowState;
 use crate::table::Table;
 use crate::{LogError, Meta, Segment, TorqueSensor};
 
-/// Reads a log and its metadata: those in the files, else those of the metadata file, else default metadata.
+/// Reads a log and its metadata: those in the files, else those of the metadata file, else default metadata; and whether `Log::write`
+/// wrote the files.
 ///
 /// `files` are the parts of one recording; errors name the first. A recording without commands is read if `has_commands` is false.
-pub(crate) fn read(files: &[PathBuf], meta_file: Option<Meta>, has_commands: bool) -> Result<(Table, Meta), LogError> {
+pub(crate) fn read(
+    files: &[PathBuf],
+    meta_file: Option<Meta>,
+    has_commands: bool,
+) -> Result<(Table, Meta, bool), LogError> {
     let file = &files[0];
     let mut recording = Recording::read(files)?;
     let (robot, others) = recording.take_robot();
@@ -31,11 +36,12 @@ pub(crate) fn read(files: &[PathBuf], meta_file: Option<Meta>, has_commands: boo
     if !others.is_empty() {
         table.notes.push(format!("the states of other robots are left out: topics in {}", others.join(", ")));
     }
+    let is_written = own_meta.is_some();
     let meta = match (own_meta, meta_file) {
         (Some((meta, _)), _) | (None, Some(meta)) => meta,
         (None, None) => default_meta(&table, rate_hz),
     };
-    Ok((table, meta))
+    Ok((table, meta, is_written))
 }
 
 /// Returns the default metadata of a recording.

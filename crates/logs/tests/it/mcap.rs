@@ -287,6 +287,23 @@ fn recording_of_the_robot_is_reordered_to_the_joint_order() {
 }
 
 #[test]
+fn the_torque_of_a_message_is_that_of_the_row_before() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("robot.mcap");
+    let mut recorder = Recorder::create(&path);
+    for row in 0..4u8 {
+        let mut state = state_bytes();
+        put(&mut state, 76 + 16, &f32::from(row).to_le_bytes());
+        recorder.state("rt/lowstate", u64::from(row) * 2_000_000, &state);
+        recorder.command("rt/lowcmd", u64::from(row) * 2_000_000, &command_bytes(FIRST));
+    }
+    recorder.finish();
+    let torque = Log::open(&path).expect("a log").tau_measured("FR_hip").expect("torques").to_vec();
+    assert_eq!(torque[..3], [1.0, 2.0, 3.0]);
+    assert!(torque[3].is_nan(), "no message follows the last one: {torque:?}");
+}
+
+#[test]
 fn chunks_of_every_compression_are_read() {
     let folder = tempfile::tempdir().expect("a folder");
     for (name, compression) in

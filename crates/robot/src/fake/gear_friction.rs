@@ -1,4 +1,4 @@
-//! Friction that keeps a motor without gains where it is.
+//! Friction that keeps a motor without gains where it is. A motor that damps its joint has none, like one that holds it.
 
 use twinstep_model::{Command, PerJoint};
 
@@ -30,13 +30,13 @@ impl GearFriction {
         }
         let reach = self.sliding / STIFFNESS;
         for (joint, (anchor, q)) in self.anchor.iter_mut().zip(q).enumerate() {
-            if command.kp[joint] != 0.0 {
+            if command.kp[joint] != 0.0 || command.kd[joint] > DRAG {
                 *anchor = *q;
                 continue;
             }
             *anchor = anchor.clamp(q - reach, q + reach);
             (command.q[joint], command.kp[joint]) = (*anchor, STIFFNESS);
-            command.kd[joint] = command.kd[joint].max(DRAG);
+            command.kd[joint] = DRAG;
         }
     }
 }
