@@ -286,21 +286,36 @@ fn recording_of_the_robot_is_reordered_to_the_joint_order() {
     .assert_debug_eq(&log.read_warnings());
 }
 
-#[test]
-fn the_torque_of_a_message_is_that_of_the_row_before() {
+/// Records states of which each is sent `times`, with a motion in the positions and torques that grow. Returns the torques of the log.
+fn torques_of_states(count: u16, times: u64) -> Vec<f64> {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("robot.mcap");
     let mut recorder = Recorder::create(&path);
-    for row in 0..4u8 {
-        let mut state = state_bytes();
-        put(&mut state, 76 + 16, &f32::from(row).to_le_bytes());
-        recorder.state("rt/lowstate", u64::from(row) * 2_000_000, &state);
-        recorder.command("rt/lowcmd", u64::from(row) * 2_000_000, &command_bytes(FIRST));
+    for row in 0..u64::from(count) * times {
+        let (mut state, reading) = (state_bytes(), (row / times) as f32);
+        for motor in 0..12 {
+            put(&mut state, 76 + 48 * motor + 4, &(0.3 * (0.2 * reading).sin()).to_le_bytes());
+            put(&mut state, 76 + 48 * motor + 16, &reading.to_le_bytes());
+        }
+        recorder.state("rt/lowstate", row * 2_000_000, &state);
+        recorder.command("rt/lowcmd", row * 2_000_000, &command_bytes(FIRST));
     }
     recorder.finish();
-    let torque = Log::open(&path).expect("a log").tau_measured("FR_hip").expect("torques").to_vec();
-    assert_eq!(torque[..3], [1.0, 2.0, 3.0]);
-    assert!(torque[3].is_nan(), "no message follows the last one: {torque:?}");
+    Log::open(&path).expect("a log").tau_measured("FR_hip").expect("torques").to_vec()
+}
+
+#[test]
+fn the_torque_of_a_message_is_that_of_the_row_before() {
+    let torques = torques_of_states(4, 1);
+    assert_eq!(torques[..3], [1.0, 2.0, 3.0]);
+    assert!(torques[3].is_nan(), "no message follows the last one: {torques:?}");
+}
+
+/// The torque between two readings is the mean of both, if the readings repeat.
+#[test]
+fn torques_that_repeat_are_those_of_their_messages() {
+    let torques = torques_of_states(40, 5);
+    assert_eq!(torques[95..105], [19.0, 19.0, 19.0, 19.0, 19.0, 20.0, 20.0, 20.0, 20.0, 20.0]);
 }
 
 #[test]
