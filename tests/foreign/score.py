@@ -23,6 +23,7 @@ RATES: dict[str, Callable[[Case], bool | None]] = {
     "name and scope right, nothing else reported": lambda c: c.get("all_right"),
     "size within 20 %, of named effects": lambda c: None if c.get("size_error") is None else c["size_error"] <= 0.2,
     "95 % intervals contain the truth, of named effects": lambda c: c.get("covers"),
+    "90 % interval of the predicted gain contains the found one": lambda c: c.get("promise_kept"),
     "at least one wrong name": lambda c: None if "wrong_names" not in c else c["wrong_names"] > 0,
     "program failed or timed out": lambda c: c["failed"],
     "trivial: joint of largest torque residual is in the scope": lambda c: c.get("trivial_right"),
@@ -57,6 +58,15 @@ def run_program(program: Path, case: Path, label: str) -> dict[str, Any]:
     return result
 
 
+def promise_kept(findings: Path) -> bool | None:
+    """Return whether the found reduction of the joint error is in the predicted interval; None without a prediction."""
+    promise = json.loads(findings.read_text()).get("promise")
+    if promise is None:
+        return None
+    low, high = promise["all"]["interval"]
+    return bool(low <= promise["all"]["found"] <= high)
+
+
 def score_case(case: Path, label: str, run: dict[str, Any]) -> Case:
     """Return the score of one case whose program has run."""
     truth = json.loads((case / "truth.json").read_text())
@@ -68,6 +78,8 @@ def score_case(case: Path, label: str, run: dict[str, Any]) -> Case:
     findings = read_findings(case / f"diagnosis_{label}") if run["status"] == 0 else None
     result["failed"] = findings is None
     result |= compare(truth, findings or [])
+    if run["status"] == 0:
+        result["promise_kept"] = promise_kept(case / f"diagnosis_{label}" / "findings.json")
     scopes = [scope_joints(e["scope"]) for e in hidden]
     if len(scopes) == 1 and scopes[0] <= scope_joints("all") and len(scopes[0]) < 12:
         joint = trivial_baseline(case / "log", case / "trivial.json")["joint"]

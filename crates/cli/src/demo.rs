@@ -123,5 +123,5 @@ fn compare(out: &Path, signals: &Signals) -> CommandResult {
     println!("measured and simulated position of each joint: {}", picture.display());
     println!("recording, as a log folder: {}", folder.display());
     eprintln!("\n4. Diagnosis: which effects explain the difference?");
-    diagnose_and_print(&DiagnoseOptions::new(vec![folder], out.join("diagnosis")), false)
+    diagnose_and_print(&DiagnoseOptions::new(vec![folder], out.join("diagnosis")), false).map(drop)
 }

@@ -2,9 +2,9 @@
 
 use std::path::PathBuf;
 
-use twinstep_workflows::{DiagnoseOptions, Observer, diagnose};
+use twinstep_workflows::{DiagnoseOptions, Diagnosed, Observer, diagnose};
 
-use crate::exit::{CommandResult, other};
+use crate::exit::{CommandResult, Failure, other};
 
 /// Find the effects that a robot model lacks, estimate their parameters and write the corrected model.
 ///
@@ -14,8 +14,8 @@ use crate::exit::{CommandResult, other};
 /// fixed, an ensemble of networks then learns the missing torque. It is kept if it reduces the error on held-out blocks by a fifth;
 /// extended.toml adds it to the laws (`[actuator] mode = "residual"`).
 ///
-/// Logs of a Go2 without motor currents are searched in simulations: every effect is tested on every joint, leg, side and joint type,
-/// fitted to one fold of the log and evaluated on the other. That takes minutes, and is less reliable.
+/// Without motor currents the torques of the drives by their laws take their place. If the base is fixed, positions are compared
+/// with simulations; that takes longer.
 ///
 /// DIR gets report.html for a browser, findings.json for programs and extended.toml, the corrected model, which
 /// `twinstep serve --model` loads. motion_before.html and motion_after.html play the first 20 s of the log, with the
@@ -42,20 +42,27 @@ pub struct Args {
     /// Print findings.json to stdout too, and nothing else.
     #[arg(long)]
     json: bool,
+    /// Print why each cause was added, changed or removed, and why every other effect of the catalogue is no cause.
+    #[arg(long, conflicts_with = "json")]
+    explain: bool,
 }
 
 /// Diagnoses the logs, writes the output folder and prints a summary.
 pub fn run(args: &Args) -> CommandResult {
     let options = DiagnoseOptions { model: args.model.clone(), ..DiagnoseOptions::new(args.logs.clone(), &args.out) };
-    diagnose_and_print(&options, args.json)
+    let found = diagnose_and_print(&options, args.json)?;
+    if args.explain {
+        print!("{}", found.why);
+    }
+    Ok(())
 }
 
 /// Diagnoses logs and prints a summary, or the findings as JSON.
-pub fn diagnose_and_print(options: &DiagnoseOptions, json: bool) -> CommandResult {
+pub fn diagnose_and_print(options: &DiagnoseOptions, json: bool) -> Result<Diagnosed, Failure> {
     let found = diagnose(options, &Observer::terminal()?)?;
     if json {
         println!("{}", serde_json::to_string_pretty(&found.diagnosis).map_err(other)?);
-        return Ok(());
+        return Ok(found);
     }
     print!("{}", found.text);
     if let Some(report) = &found.report {
@@ -64,5 +71,5 @@ pub fn diagnose_and_print(options: &DiagnoseOptions, json: bool) -> CommandResul
     for motion in &found.motions {
         println!("robot and simulation: {}", motion.display());
     }
-    Ok(())
+    Ok(found)
 }

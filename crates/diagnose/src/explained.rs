@@ -3,16 +3,19 @@
 use std::collections::BTreeMap;
 
 use twinstep_effects::Effect;
-use twinstep_inference::equations::{Explained, Explanation, UnknownLaw};
+use twinstep_inference::equations::{Explained, Explanation, Passed, UnknownLaw};
 
 use super::findings::{
-    AlternativeCause, Cause, CorrelatedPair, Estimate, ParameterValue, Unexplained, WeightedHypothesis,
+    AlternativeCause, Cause, CorrelatedPair, Estimate, LawTerm, NotReported, ParameterValue, Unexplained,
+    WeightedHypothesis,
 };
 
 /// Evidence by which a cause must be better than without it [nat].
 const LEAST_GAIN: f64 = 3.0;
 /// Evidence by which a rival may be worse than a cause, and still be as good an explanation: odds of 20 to 1 [nat].
 pub const AMBIGUOUS: f64 = 3.0;
+/// Standard deviations of a normal distribution within which 95 % are.
+const TWO_SIDED_95: f64 = 1.96;
 /// Absolute correlation of two estimates from which they are reported.
 const CORRELATED: f64 = 0.9;
 
@@ -21,7 +24,7 @@ const LEAST_LEFT: f64 = 0.02;
 
 /// Returns the strongest law that the catalogue does not have.
 pub fn unexplained_law(found: &Explained) -> Unexplained {
-    let Some(UnknownLaw { joint, of_drive, variable, gain }) = found.unknown.first() else {
+    let Some(UnknownLaw { joint, of_drive, variable, terms, gain }) = found.unknown.first() else {
         if !found.is_of_positions || found.left < LEAST_LEFT {
             return only_noise();
         }
@@ -30,21 +33,42 @@ pub fn unexplained_law(found: &Explained) -> Unexplained {
              looked for.",
             100.0 * found.left
         );
-        return Unexplained { fraction: found.left, depends_on: Vec::new(), text };
+        return Unexplained { fraction: found.left, text, ..Unexplained::default() };
     };
     let channel = if *variable == "t" { "t".to_owned() } else { format!("{variable}_{joint}") };
     let place = if *of_drive { "The torque of the drive" } else { "The torque on the link" };
     let others = found.unknown.len() - 1;
     let more = if others == 0 { String::new() } else { format!(" So do {others} more equations.") };
+    let law: Vec<LawTerm> = terms.iter().map(law_term).collect();
+    let sum = law.iter().map(|term| format!("{:.2} N·m of {}", term.torque_nm, term.formula));
+    let sum = sum.collect::<Vec<_>>().join(", ");
+    let form =
+        if sum.is_empty() { format!("its size changes with {channel}") } else { format!("it is the sum of {sum}") };
     let text = format!(
-        "{place} of {joint} has another law, which the catalogue does not have: a function of {channel} and others explains what the causes leave, with {gain:.0} nat.{more}"
+        "{place} of {joint} has another law, which the catalogue does not have: {form}. It explains {gain:.0} nat.{more}"
     );
-    Unexplained { fraction: found.left, depends_on: vec![channel], text }
+    Unexplained { fraction: found.left, depends_on: vec![channel], law, text }
+}
+
+fn law_term((formula, torque, std): &(&str, f64, f64)) -> LawTerm {
+    let half = TWO_SIDED_95 * std;
+    LawTerm { formula: (*formula).to_owned(), torque_nm: *torque, interval: [torque - half, torque + half] }
 }
 
 /// Returns the result for a residual that does not exceed noise.
 fn only_noise() -> Unexplained {
-    Unexplained { fraction: 0.0, depends_on: Vec::new(), text: "The residual is noise.".to_owned() }
+    Unexplained { text: "The residual is noise.".to_owned(), ..Unexplained::default() }
+}
+
+/// Returns why the effects that are no cause are none.
+pub fn not_reported(found: &Explained) -> Vec<NotReported> {
+    let of = |passed: &Passed| NotReported {
+        effect: passed.effect.name.to_owned(),
+        scope: passed.best.as_ref().map(|(scope, _)| scope.clone()),
+        gain_nats: passed.best.as_ref().map(|(_, gain)| *gain),
+        reason: passed.reason.to_owned(),
+    };
+    found.passed.iter().map(of).collect()
 }
 
 /// Returns the experiment that discriminates between two effects.

@@ -27,6 +27,10 @@ pub struct Diagnosis {
     pub confusable: Vec<CorrelatedPair>,
     /// Unexplained residual.
     pub unexplained: Unexplained,
+    /// By how much the extended model, without networks, was predicted to reduce the error of the held-out blocks, and what was found. `None`
+    /// without causes or positions.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub promise: Option<Promise>,
     /// Networks that have learned what no cause explains; `None` if there is little of it, or they do not predict it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub learned_residual: Option<LearnedResidual>,
@@ -38,8 +42,36 @@ pub struct Diagnosis {
     /// motor currents.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub decisions: Vec<String>,
+    /// The effects of the catalogue that are no cause, the closest first.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub not_reported: Vec<NotReported>,
     /// File name of the corrected model, in the same folder.
     pub extended_model: String,
+}
+
+/// An effect of the catalogue that is no cause.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct NotReported {
+    /// Name of the effect.
+    pub effect: String,
+    /// Its best scope; `None` if it explains nothing.
+    pub scope: Option<String>,
+    /// By how much it would be better than what was found, by the screening [nat].
+    pub gain_nats: Option<f64>,
+    /// Why it is no cause, as a sentence.
+    pub reason: String,
+}
+
+/// Function of what a joint measures: a part of a law that the catalogue does not have.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct LawTerm {
+    /// Formula in measurements relative to their standard deviations: position q, velocity dq, position error e, torque tau, temperature
+    /// T, time t.
+    pub formula: String,
+    /// Torque, root mean square over the log, with the sign of the formula [N·m].
+    pub torque_nm: f64,
+    /// 95 % interval [N·m].
+    pub interval: [f64; 2],
 }
 
 impl Diagnosis {
@@ -75,6 +107,26 @@ pub struct LearnedResidual {
     pub uncertainty_ratio: Option<f64>,
 }
 
+/// Predicted reduction of the position error of joints in closed loop.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Promise {
+    /// Of all joints together.
+    pub all: Reduction,
+    /// Of each joint, by name.
+    pub by_joint: BTreeMap<String, Reduction>,
+}
+
+/// Reduction of an error: 1 − RMSE after / RMSE before.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Reduction {
+    /// Median of what the intervals of the extended model predict.
+    pub predicted: f64,
+    /// 90 % interval.
+    pub interval: [f64; 2],
+    /// What was found.
+    pub found: f64,
+}
+
 /// Root mean square errors; null if they were not measured.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct RmsErrors {
@@ -93,11 +145,11 @@ pub struct Cause {
     pub scope: String,
     /// Estimates of the parameters, by name.
     pub parameters: BTreeMap<String, Estimate>,
-    /// 1 − RMSE after / RMSE before, cross-validated in the affected channels, on top of the causes before it.
+    /// 1 − RMSE after / RMSE before, in the equations that it changes, on top of the other causes.
     pub held_out_gain: f64,
-    /// Cross-validated log-likelihood gain after penalties [nat].
+    /// Evidence of all causes minus that without this one [nat].
     pub score_nats: f64,
-    /// Threshold of the log-likelihood gain: a quantile of what the best of all hypotheses gains if none is true [nat].
+    /// Evidence that a cause must gain [nat].
     pub threshold_nats: f64,
     /// Ambiguous alternatives, which explain the log equally well, as in `armature@calf`.
     pub ambiguous_with: Vec<String>,
@@ -200,6 +252,9 @@ pub struct Unexplained {
     pub fraction: f64,
     /// Channels on which the residual depends, such as `q_FR_hip`, the strongest first.
     pub depends_on: Vec<String>,
+    /// The law that the catalogue does not have: the sum of these functions.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub law: Vec<LawTerm>,
     /// Description, as text.
     pub text: String,
 }

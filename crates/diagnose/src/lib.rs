@@ -3,7 +3,7 @@
 //! The causes are those of highest evidence in the equations of the logs ([`twinstep_inference::equations`]).
 //!
 //! - [`of_go2`]: logs of a Go2; [`of_tree`]: logs of a robot of any tree. [`explained`]: their [`findings`]; [`data_split`]: rows for fits, and
-//!   held-out rows of another regime, on which errors are measured.
+//!   held-out rows of another regime, on which errors are measured. [`promise`]: what they will be.
 //! - [`discrimination`], [`experiment_design`]: choose an experiment that discriminates between ambiguous causes, by simulations of
 //!   [`excitation`] trajectories; [`hypothesis`]: an effect on a scope, with values; [`fit_problem`]: its fit.
 //! - [`true_law`]: how evident a known effect is in a log, by simulations. [`residual_rows`]: residuals of rows; [`residual_power`]: their sums of
@@ -19,6 +19,7 @@ mod fit_problem;
 mod hypothesis;
 mod of_go2;
 mod of_tree;
+mod promise;
 mod residual_data;
 mod residual_power;
 mod residual_rows;
@@ -34,8 +35,8 @@ pub use discrimination::HypothesisPair;
 pub use excitation::{EXCITATION_TRAJECTORIES, ExcitationTrajectory};
 pub use experiment_design::ProposedExperiment;
 pub use findings::{
-    AlternativeCause, Cause, CorrelatedPair, Diagnosis, DiscriminatedPair, Estimate, LearnedResidual, NextExperiment,
-    ParameterValue, RmsErrors, Unexplained, WeightedHypothesis,
+    AlternativeCause, Cause, CorrelatedPair, Diagnosis, DiscriminatedPair, Estimate, LawTerm, LearnedResidual,
+    NextExperiment, NotReported, ParameterValue, Promise, Reduction, RmsErrors, Unexplained, WeightedHypothesis,
 };
 pub use of_go2::diagnose;
 pub use of_tree::{TreeDiagnosis, diagnose_tree};

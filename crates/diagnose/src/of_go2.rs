@@ -16,9 +16,10 @@ use twinstep_logs::replay::check_gains;
 use twinstep_model::{JOINT_NAMES, Joint, RobotModel, Rollout};
 
 use super::data_split::fitted_rows;
-use super::explained::{AMBIGUOUS, also_fitted, confusable, finding, unexplained_law};
+use super::explained::{AMBIGUOUS, also_fitted, confusable, finding, not_reported, unexplained_law};
 use super::findings::{Diagnosis, RmsErrors};
 use super::hypothesis::Hypothesis;
+use super::promise::promise;
 use super::residual_data::ResidualData;
 use super::{DiagnoseError, DiagnoseProgress, DiagnosisOutput, ExperimentError, experiment_design, held_out_rows};
 
@@ -57,6 +58,11 @@ pub fn diagnose(
     let corrected = extended.robot_model()?;
     let lacks_torque = evidence.residual_power(simulator, &corrected).shows_missing_torque(LEAST_EXCESS);
     let [baseline, after] = [&robot, &corrected].map(|robot| errors(logs, &held_out, robot, simulator));
+    let promise = if extended.effects == model.effects {
+        None
+    } else {
+        promise(logs, &held_out, (&robot, &extended), simulator, &mut say)?
+    };
     say("choosing the next experiment")?;
     let confusable = confusable(&found);
     let ambiguous: Vec<(Hypothesis, Vec<Hypothesis>)> = found.causes.iter().map(hypotheses).collect();
@@ -73,8 +79,10 @@ pub fn diagnose(
         also_fitted: also_fitted(&found, &joints),
         confusable,
         unexplained: unexplained_law(&found),
+        promise,
         learned_residual: None,
         next_experiment: next.as_ref().map(|next| next.summary.clone()),
+        not_reported: not_reported(&found),
         decisions: found.decisions,
         extended_model: String::new(),
     };

@@ -12,7 +12,7 @@ use twinstep_logs::Log;
 use twinstep_model::TreeModel;
 
 use super::data_split::fitted_rows;
-use super::explained::{also_fitted, confusable, finding, unexplained_law};
+use super::explained::{also_fitted, confusable, finding, not_reported, unexplained_law};
 use super::findings::{Diagnosis, RmsErrors};
 use super::{DiagnoseError, DiagnoseProgress, held_out_rows};
 
@@ -65,8 +65,10 @@ pub fn diagnose_tree(
         also_fitted: also_fitted(&found, &joints),
         confusable: confusable(&found),
         unexplained: unexplained_law(&found),
+        promise: None,
         learned_residual: None,
         next_experiment: None,
+        not_reported: not_reported(&found),
         decisions: found.decisions,
         extended_model: String::new(),
     };

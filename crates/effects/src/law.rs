@@ -1,7 +1,6 @@
 //! An effect as equations of motion see it: unknowns in which it is nearly linear, with their priors.
 //!
-//! Diagnosis compares the evidence of [`LawForm`]s. An effect may have several, such as either gain alone and both; effects of the ground
-//! have none.
+//! Diagnosis compares the evidence of [`LawForm`]s. An effect may have several, such as either gain alone and both.
 
 use twinstep_model::JointModel;
 
@@ -22,6 +21,8 @@ pub enum Place {
     Body,
     /// The gyroscope.
     Gyro,
+    /// Feet on the ground.
+    Ground,
 }
 
 /// Where every joint has a little of an effect, too little to report.

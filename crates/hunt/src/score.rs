@@ -258,6 +258,8 @@ mod tests {
     fn diagnosis(findings: Vec<Cause>) -> Diagnosis {
         Diagnosis {
             decisions: Vec::new(),
+            not_reported: Vec::new(),
+            promise: None,
             baseline: RmsErrors { torque_rmse_nm: Some(1.0), q_rmse_rad: Some(0.020) },
             extended: RmsErrors { torque_rmse_nm: Some(0.6), q_rmse_rad: Some(0.008) },
             noise_floor: RmsErrors::default(),

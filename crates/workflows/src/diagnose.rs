@@ -46,6 +46,8 @@ pub struct Diagnosed {
     pub motions: Vec<PathBuf>,
     /// Summary for a terminal.
     pub text: String,
+    /// Why each cause was added, changed or removed, and why every other effect is no cause.
+    pub why: String,
 }
 
 /// Folder of the proposed experiment, in the output folder.
@@ -137,7 +139,8 @@ fn of_quadruped(options: &DiagnoseOptions, logs: &[Log], observer: &Observer) ->
     let report = write_page(options, logs, (&model, &laws), &diagnosis, (&motions, &mut simulator))?;
     let motions = motions.iter().map(|motion| options.out.join(motion)).collect();
     let text = write_findings(options, &diagnosis)?;
-    Ok(Diagnosed { diagnosis, report: Some(report), motions, text })
+    let why = diagnosis_text::why(&diagnosis);
+    Ok(Diagnosed { diagnosis, report: Some(report), motions, text, why })
 }
 
 /// Writes the corrected model, with the networks if there are any. Returns its simulated robot.
@@ -226,7 +229,8 @@ fn of_tree(
         write_file(options, "extended.toml", &extended.to_toml())?;
     }
     let text = write_findings(options, &diagnosis)?;
-    Ok(Diagnosed { diagnosis, report: None, motions: Vec::new(), text })
+    let why = diagnosis_text::why(&diagnosis);
+    Ok(Diagnosed { diagnosis, report: None, motions: Vec::new(), text, why })
 }
 
 /// Writes the pages of the robot and its simulation with both models. Returns their names: none if the log cannot be played.

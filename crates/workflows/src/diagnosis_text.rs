@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use twinstep_diagnose::{Diagnosis, ParameterValue, RmsErrors};
+use twinstep_diagnose::{Diagnosis, ParameterValue, Promise, Reduction, RmsErrors};
 
 use crate::ambiguous_effects;
 
@@ -50,8 +50,31 @@ pub fn text(diagnosis: &Diagnosis, out: &Path) -> String {
         lines.push(format!("next experiment of a walking robot, about {}: {command}", unknowns.join(", ")));
     }
     lines.push(error_line("closed-loop joint RMSE [rad]", diagnosis, |errors| errors.q_rmse_rad));
+    lines.extend(diagnosis.promise.as_ref().map(promise));
     lines.push(error_line("torque RMSE [N·m]", diagnosis, |errors| errors.torque_rmse_nm));
     lines.join("\n") + "\n"
+}
+
+/// Returns why causes were added, changed or removed, and why every other effect of the catalogue is no cause.
+pub fn why(diagnosis: &Diagnosis) -> String {
+    let mut lines = vec!["Decisions, with the evidence of each candidate [nat]:".to_owned()];
+    lines.extend(diagnosis.decisions.iter().map(|line| format!("  {line}")));
+    lines.push("Effects that are no cause:".to_owned());
+    lines.extend(diagnosis.not_reported.iter().map(|one| {
+        let name = one.scope.as_ref().map_or_else(|| one.effect.clone(), |scope| format!("{}@{scope}", one.effect));
+        let gain = one.gain_nats.map_or(String::new(), |gain| format!(" {gain:.1} nat."));
+        format!("  {name}:{gain} {}", one.reason)
+    }));
+    lines.join("\n") + "\n"
+}
+
+/// Returns the line on the predicted reduction of the error.
+fn promise(promise: &Promise) -> String {
+    let Reduction { predicted, interval: [low, high], found } = promise.all;
+    let [predicted, low, high, found] = [predicted, low, high, found].map(|share| 100.0 * share);
+    format!(
+        "    the laws alone: a reduction by {predicted:.0} % was predicted (90 % interval {low:.0} to {high:.0} %), {found:.0} % was found"
+    )
 }
 
 /// Returns the line on gains that differ from joint to joint, if they do.

@@ -1,8 +1,8 @@
 //! Friction coefficient of the ground.
 
 use crate::{
-    Apply, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity, Search, Target,
-    Variable, Visibility, demo,
+    Apply, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place, PlotQuantity,
+    Presence, Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -39,7 +39,7 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::Time, PlotQuantity::LateralAcceleration],
     },
     blind_test: None,
-    laws: &[],
+    laws: &[LawForm::new(Place::Ground, &[0.3], |c, _| vec![0.8 + c[0]]).with_small(&[0.05], Presence::Torques)],
     amount: None,
     apply: Apply::Robot(|robot, _, values| {
         robot.contact.friction = values[0];

@@ -1,8 +1,8 @@
 //! Compliance of the ground or of the feet.
 
 use crate::{
-    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, Parameter, PlotQuantity,
-    Search, Target, Variable, Visibility, demo,
+    Apply, BlindTestCondition, Composition, Confounder, DataRequirement, Effect, EffectDemo, LawForm, Parameter, Place,
+    PlotQuantity, Presence, Search, Target, Variable, Visibility, demo,
 };
 
 pub const EFFECT: Effect = Effect {
@@ -41,7 +41,9 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::Time, PlotQuantity::Force],
     },
     blind_test: Some(&[BlindTestCondition::FloatingBase]),
-    laws: &[],
+    // Feet sink in proportion to the square of the time constant.
+    laws: &[LawForm::positive(Place::Ground, &[0.5], |c, _| vec![0.04 * c[0].max(0.0025).sqrt()])
+        .with_small(&[0.03], Presence::Torques)],
     amount: None,
     apply: Apply::Robot(|robot, _, values| {
         robot.contact.time_constant = values[0];

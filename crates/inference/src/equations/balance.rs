@@ -8,12 +8,19 @@ use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 use twinstep_dynamics::Vec3;
 use twinstep_dynamics::tree::{TreeAcceleration, TreeMotion, TreeParameters, TreeStructure, inverse_dynamics};
+use twinstep_model::Foot;
 
 use super::block::Block;
+use super::ground::Touch;
 use super::measurements::{Measurements, Regime};
 use super::robot::Robot;
 use super::samples::{GRAVITY, Motion, Sample, samples, weights};
 use super::undetermined::Weighting;
+
+/// Error of the height of a foot, by the orientation of the base and the shape of the foot [m].
+const HEIGHT_ERROR: f64 = 5e-4;
+/// Force on a foot per torque of its joints [1/m].
+const FORCE_PER_TORQUE: f64 = 10.0;
 
 /// Samples, and where their residuals are in the blocks.
 pub struct Balance {
@@ -85,6 +92,7 @@ impl Balance {
         for (axis, sigma) in axes.into_iter().zip(base_noise(measured, &self.samples)) {
             series.push(Block { name: format!("base {axis} stand"), t: Vec::new(), y: Vec::new(), sigma });
         }
+        series.extend(self.feet_blocks(measured, robot));
         let first = self.first_block;
         for sample in &self.samples {
             let residuals = self.residuals_of(sample);
@@ -104,12 +112,32 @@ impl Balance {
     fn residuals_of(&self, sample: &Sample) -> Vec<usize> {
         let free = (0..self.joints).filter(|joint| sample.is_free[*joint] && sample.turns[*joint]);
         let of_bases = 2 * self.joints;
-        match sample.regime {
+        let mut residuals: Vec<usize> = match sample.regime {
             Regime::Hang => free.collect(),
             Regime::Stand => (of_bases..of_bases + 6).collect(),
             // The base of a robot that moves fast lacks forces of its impacts, which are no noise.
             Regime::Move => free.map(|joint| self.joints + joint).collect(),
+        };
+        let (first, feet) = (of_bases + 6, self.reference.feet.len());
+        for touch in &sample.touches {
+            residuals.extend(touch.along.map(|_| first + touch.foot));
+            residuals.extend(touch.height.map(|_| first + feet + touch.foot));
         }
+        residuals
+    }
+
+    /// Returns the blocks of sliding and standing feet, without rows.
+    fn feet_blocks(&self, measured: &Measurements, robot: &Robot) -> Vec<Block> {
+        let rows = weights(4).iter().map(|weight| weight * weight).sum::<f64>();
+        let of_base = measured.base.as_ref().map_or(0.0, |base| base.height_noise);
+        let height = (of_base * of_base * rows + HEIGHT_ERROR * HEIGHT_ERROR).sqrt();
+        let force = FORCE_PER_TORQUE * noise(measured, &self.samples, Regime::Move);
+        let of_kind = |(kind, sigma): (&str, f64)| {
+            let block =
+                |foot: &Foot| Block { name: format!("{kind} {}", foot.name), t: Vec::new(), y: Vec::new(), sigma };
+            robot.feet.iter().map(block).collect::<Vec<_>>()
+        };
+        [("slip", force), ("height", height)].into_iter().flat_map(of_kind).collect()
     }
 
     /// Returns what is lacking for the robot of the columns, by sample: the measured torques minus what the motion needs.
@@ -197,65 +225,98 @@ impl Balance {
         self.samples.par_iter().enumerate().map(balanced).collect()
     }
 
-    /// Writes the residuals of a robot, given what its motion needs and the torques of its motors in balance.
+    /// Returns what a robot lacks, by sample, given what its motion needs and the torques of its motors in balance.
     ///
     /// `delayed` is by how much the torque of a motor differs because its sensor is late, by joint and sample.
-    pub fn write_residuals(
+    pub fn lacking_of(
         &self,
         robot: &Robot,
         needed: &[Vec<f64>],
         motors: &[Vec<f64>],
         delayed: &[Vec<f64>],
-        blocks: &mut [Block],
-    ) {
-        for (index, sample) in self.samples.iter().enumerate() {
-            let mut all = self.first_lacking[index].clone();
-            for (force, (now, before)) in all.iter_mut().zip(needed[index].iter().zip(&self.needed[index])) {
-                *force -= now - before;
-            }
-            for joint in 0..self.joints {
-                let motor = motors[index][joint];
-                all[6 + joint] += delayed[joint].get(index).copied().unwrap_or(0.0);
-                // What is between motor and link changes no torque on the link.
-                if !self.is_at_output {
-                    all[6 + joint] +=
-                        sample.link_torque(robot, joint, motor) - sample.link_torque(&self.reference, joint, motor);
-                }
-            }
-            for (residual, block, row) in &self.places[index] {
-                blocks[*block].y[*row] = self.projected(sample, &all, *residual);
-            }
-        }
+    ) -> Vec<Vec<f64>> {
+        self.lacking_with(needed, |index, sample, joint| {
+            let motor = motors[index][joint];
+            // What is between motor and link changes no torque on the link.
+            let changed = if self.is_at_output {
+                0.0
+            } else {
+                sample.link_torque(robot, joint, motor) - sample.link_torque(&self.reference, joint, motor)
+            };
+            changed + delayed[joint].get(index).copied().unwrap_or(0.0)
+        })
     }
 
-    /// Writes the residuals of a robot whose torques were not measured, given what its motion needs, and the torques of the motors by its
-    /// drives and by those of the reference, by joint and sample.
-    pub fn write_drive_residuals(
+    /// Returns what a robot lacks whose torques were not measured, by sample, given what its motion needs, and the torques of the motors by
+    /// its drives and by those of the reference, by joint and sample.
+    pub fn lacking_of_drives(
         &self,
         robot: &Robot,
         needed: &[Vec<f64>],
         [now, before]: [&[Vec<f64>]; 2],
-        blocks: &mut [Block],
-    ) {
-        for (index, sample) in self.samples.iter().enumerate() {
+    ) -> Vec<Vec<f64>> {
+        self.lacking_with(needed, |index, sample, joint| {
+            sample.link_torque(robot, joint, now[joint][index])
+                - sample.link_torque(&self.reference, joint, before[joint][index])
+        })
+    }
+
+    /// Returns what is lacking with other needs and other torques on the links, by sample.
+    fn lacking_with(
+        &self,
+        needed: &[Vec<f64>],
+        change: impl Fn(usize, &Sample, usize) -> f64 + Send + Sync,
+    ) -> Vec<Vec<f64>> {
+        let lacking = |(index, sample): (usize, &Sample)| {
             let mut all = self.first_lacking[index].clone();
             for (force, (now, before)) in all.iter_mut().zip(needed[index].iter().zip(&self.needed[index])) {
                 *force -= now - before;
             }
             for joint in 0..self.joints {
-                all[6 + joint] += sample.link_torque(robot, joint, now[joint][index])
-                    - sample.link_torque(&self.reference, joint, before[joint][index]);
+                all[6 + joint] += change(index, sample, joint);
             }
+            all
+        };
+        self.samples.par_iter().enumerate().map(lacking).collect()
+    }
+
+    /// Writes the residuals of a robot, given what it lacks, and how links move differently from their encoders, by joint and sample.
+    pub fn write_residuals(&self, robot: &Robot, lacking: &[Vec<f64>], shifts: &[Vec<[f64; 3]>], blocks: &mut [Block]) {
+        for (index, sample) in self.samples.iter().enumerate() {
             for (residual, block, row) in &self.places[index] {
-                blocks[*block].y[*row] = self.projected(sample, &all, *residual);
+                blocks[*block].y[*row] = match self.of_foot(sample, *residual) {
+                    None => self.projected(sample, &lacking[index], *residual),
+                    Some((touch, false)) => touch.slip(robot.ground_friction, &lacking[index]),
+                    Some((touch, true)) => {
+                        let moved = |joint: usize| {
+                            let shift = shifts[joint].get(index).map_or(0.0, |shift| shift[0]);
+                            let offset = |robot: &Robot| robot.joints[joint].actuator.encoder_offset;
+                            touch.lever(joint) * (shift - offset(robot) + offset(&self.reference))
+                        };
+                        let height = touch.height.map_or(0.0, |(height, _)| height);
+                        let depth = touch.depth * robot.contact_time.powi(2) * touch.normal_force(&lacking[index]);
+                        height + depth + (0..self.joints).map(moved).sum::<f64>()
+                    }
+                };
             }
         }
     }
 
-    /// Returns a residual, given moment and force at the base and the torques of the joints.
+    /// Returns the foot of a residual of a sample, and true for its height, false for its slip.
+    pub fn of_foot<'a>(&self, sample: &'a Sample, residual: usize) -> Option<(&'a Touch, bool)> {
+        let index = residual.checked_sub(2 * self.joints + 6)?;
+        let feet = self.reference.feet.len();
+        let touch = sample.touches.iter().find(|touch| touch.foot == index % feet)?;
+        Some((touch, index >= feet))
+    }
+
+    /// Returns a residual of forces, given moment and force at the base and the torques of the joints.
     pub fn projected(&self, sample: &Sample, forces: &[f64], residual: usize) -> f64 {
         if residual < 2 * self.joints {
             return forces[6 + residual % self.joints];
+        }
+        if let Some((touch, is_height)) = self.of_foot(sample, residual) {
+            return if is_height { 0.0 } else { touch.slip(self.reference.ground_friction, forces) };
         }
         let axis = residual - 2 * self.joints;
         sample.weighting.as_ref().map_or(0.0, |weighting| weighting.along(axis, forces, &forces[6..]))

@@ -4,7 +4,7 @@ use super::residuals::Little;
 use super::site::Site;
 
 /// Standard deviation of a joint's value around that of its scope, where they are alike, relative to the prior's.
-const SPREAD: f64 = 0.15;
+pub const SPREAD: f64 = 0.15;
 
 /// Joints, or a part of a robot, on which an effect may act.
 #[derive(Clone, Debug, PartialEq)]
@@ -99,7 +99,20 @@ pub struct UnknownLaw {
     pub of_drive: bool,
     /// What it depends on most, as the prefix of a channel of the log.
     pub variable: &'static str,
+    /// Formula, torque (root mean square over the rows) and its standard deviation of each of its functions, the largest first [N·m].
+    pub terms: Vec<(&'static str, f64, f64)>,
     /// Gain of the evidence [nat].
+    pub gain: f64,
+}
+
+/// The best scope of a law in a screening.
+#[derive(Clone, Debug)]
+pub struct Screened {
+    /// Index of the law.
+    pub law: usize,
+    /// Name of the scope.
+    pub scope: String,
+    /// Gain at the noise of the fit [nat].
     pub gain: f64,
 }
 
@@ -113,6 +126,10 @@ pub struct Found {
     pub left: Vec<(String, [f64; 2])>,
     /// Decisions, in order.
     pub decisions: Vec<String>,
+    /// The best scope of each law at the end, with its gain [nat].
+    pub screened: Vec<Screened>,
+    /// Causes in whose place another law explains more: law and scope.
+    pub imitations: Vec<(usize, String)>,
     /// Laws that the catalogue does not have, the strongest first.
     pub unknown: Vec<UnknownLaw>,
     /// Scales of position and velocity gain by joint, if they differ, beside the causes, by more than they are uncertain; else empty.

@@ -7,6 +7,7 @@ use twinstep_model::{RigidBody, RobotTree};
 
 use super::balance::Balance;
 use super::block::Column;
+use super::ground::Touch;
 use super::measurements::Regime;
 use super::robot::Robot;
 use super::samples::Sample;
@@ -16,6 +17,11 @@ impl Balance {
     pub fn joint_column(&self, joint: usize, change: &[f64]) -> Column {
         self.column(|index, residual| {
             let sample = &self.samples[index];
+            if let Some((touch, is_height)) = self.of_foot(sample, residual) {
+                let mut forces = vec![0.0; 6 + self.joints];
+                forces[6 + joint] = -change[index];
+                return if is_height { 0.0 } else { touch.slip(self.reference.ground_friction, &forces) };
+            }
             match residual.checked_sub(2 * self.joints) {
                 None if residual % self.joints == joint => -change[index],
                 None => 0.0,
@@ -50,13 +56,38 @@ impl Balance {
     /// Returns the column of a motion of the links that differs from that of the encoders: position, velocity and acceleration of one
     /// joint, by sample.
     pub fn motion_column(&self, joint: usize, change: &[[f64; 3]]) -> Column {
-        self.needed_column(|index, sample| {
+        let mut column = self.needed_column(|index, sample| {
             let mut motion = sample.instrument.clone();
             let [q, dq, ddq] = change[index];
             motion.q[joint] += q;
             motion.dq[joint] += dq;
             motion.ddq[joint] += ddq;
             less(self.needed(&self.bodies, &self.reference, sample, &motion, [0.0; 3]), &self.needed[index])
+        });
+        // A link that is elsewhere has its foot elsewhere.
+        column.add(&self.column(|index, residual| match self.of_foot(&self.samples[index], residual) {
+            Some((touch, true)) => -touch.lever(joint) * change[index][0],
+            _ => 0.0,
+        }));
+        column
+    }
+
+    /// Returns the column of another ground, for a robot that lacks these forces, by sample.
+    pub fn ground_column(&self, before: &Robot, after: &Robot, lacking: &[Vec<f64>]) -> Column {
+        let friction = after.ground_friction - before.ground_friction;
+        let time_square = after.contact_time.powi(2) - before.contact_time.powi(2);
+        self.column(|index, residual| match self.of_foot(&self.samples[index], residual) {
+            None => 0.0,
+            Some((touch, false)) => -friction * touch.normal_force(&lacking[index]),
+            Some((touch, true)) => -time_square * touch.depth * touch.normal_force(&lacking[index]),
+        })
+    }
+
+    /// Returns the column of a change of the heights of feet, given their foot on the ground.
+    pub fn height_column(&self, change: impl Fn(&Touch) -> f64) -> Column {
+        self.column(|index, residual| match self.of_foot(&self.samples[index], residual) {
+            Some((touch, true)) => change(touch),
+            _ => 0.0,
         })
     }
 

@@ -82,24 +82,38 @@ pub fn smooth_sign(dq: f64) -> f64 {
 }
 
 /// Returns the torque on the link of a joint [N·m], given the torque of its motor, and the motion of the encoder.
-pub fn link_torque(joint: &JointModel, motor: f64, [q, dq, ddq]: [f64; 3]) -> f64 {
+pub fn link_torque(joint: &JointModel, motor: f64, motion: [f64; 3]) -> f64 {
+    link_torque_with(joint, motor, motion, smooth_sign(motion[1]))
+}
+
+/// Returns the torque on the link of a joint [N·m], given the Coulomb friction's share of its speed.
+///
+/// What a joint does not have is not computed: most of the time of a search is spent here.
+pub fn link_torque_with(joint: &JointModel, motor: f64, [q, dq, ddq]: [f64; 3], sign: f64) -> f64 {
     let actuator = &joint.actuator;
-    let ripple = actuator.ripple.amplitude * (actuator.ripple.cycles * q + actuator.ripple.phase).sin();
-    let torque = actuator.gain * motor + ripple;
-    let speed = dq / joint.stribeck_friction.stribeck_velocity;
-    let dry = joint.coulomb_friction
-        + joint.stribeck_friction.breakaway_torque * (-speed * speed).exp()
-        + joint.load_friction * torque.abs();
+    let mut torque = actuator.gain * motor;
+    if actuator.ripple.amplitude != 0.0 {
+        torque += actuator.ripple.amplitude * (actuator.ripple.cycles * q + actuator.ripple.phase).sin();
+    }
+    let mut dry = joint.coulomb_friction + joint.load_friction * torque.abs();
+    if joint.stribeck_friction.breakaway_torque != 0.0 {
+        let speed = dq / joint.stribeck_friction.stribeck_velocity;
+        dry += joint.stribeck_friction.breakaway_torque * (-speed * speed).exp();
+    }
     let spring = joint.spring.torque_offset - joint.spring.stiffness * (q - actuator.encoder_offset);
-    torque - joint.viscous_friction * dq - dry * smooth_sign(dq) + spring - joint.armature * ddq
+    torque - joint.viscous_friction * dq - dry * sign + spring - joint.armature * ddq
 }
 
 /// Returns the torque of a motor [N·m] that has this torque on the link, given what each torque of the motor has, and its gain.
 pub fn inverse(gain: f64, link: f64, link_torque: impl Fn(f64) -> f64) -> f64 {
     let mut motor = link / gain;
-    // Friction that grows with the torque is small, so that few steps suffice.
+    // Friction that grows with the torque is small, so that few steps suffice; without it, one.
     for _ in 0..4 {
-        motor += (link - link_torque(motor)) / gain;
+        let left = link - link_torque(motor);
+        motor += left / gain;
+        if left.abs() < 1e-9 {
+            break;
+        }
     }
     motor
 }

@@ -166,7 +166,7 @@ fn scopes() -> Vec<ScopeSites> {
         types.map(|scope| ScopeSites { probability: EACH, is_alike: false, ..scope.clone() }).collect();
     let of_base =
         |name: &str| ScopeSites { name: name.to_owned(), sites: vec![Site::Base], probability: 0.5, is_alike: true };
-    of_joints.into_iter().chain(each).chain([of_base("base"), of_base("all")]).collect()
+    of_joints.into_iter().chain(each).chain([of_base("base"), of_base("all"), of_base("ground")]).collect()
 }
 
 /// Returns the scopes of the joints of a tree.

@@ -1,12 +1,13 @@
 //! What explains a log, in the terms of the catalogue: effects, scopes, values and intervals.
 
-use twinstep_effects::{Composition, Effect};
+use twinstep_effects::{CATALOGUE, Composition, Effect};
 
-use super::causes::{Cause, Found, FoundCause, UnknownLaw};
-use super::law::Law;
+use super::causes::{Cause, Found, FoundCause, Screened, UnknownLaw};
+use super::law::{Law, Place};
 use super::outcome::TWO_SIDED_95;
 use super::residuals::Little;
 use super::robot::Robot;
+use super::search::LEAST_GAIN;
 use super::site::{Site, apply, body_of};
 
 /// Relative standard deviation of a value because no law is exact.
@@ -67,6 +68,19 @@ pub struct Explained {
     pub is_of_positions: bool,
     /// Decisions of the search, as sentences.
     pub decisions: Vec<String>,
+    /// The effects of the catalogue that are no cause, the closest first.
+    pub passed: Vec<Passed>,
+}
+
+/// An effect that is no cause.
+#[derive(Clone, Debug)]
+pub struct Passed {
+    /// The effect.
+    pub effect: &'static Effect,
+    /// Its best scope, and by how much it would be better than what was found, by the screening [nat]; `None` if it explains nothing.
+    pub best: Option<(String, f64)>,
+    /// Why it is no cause, as a sentence.
+    pub reason: &'static str,
 }
 
 impl Explained {
@@ -95,6 +109,7 @@ impl Terms<'_> {
             exported.filter(|(_, one)| one.by_joint.is_empty()).map(|(found, _)| &found.cause).collect();
         let little = found.little.into_iter().map(|one| beside(one, &alike)).collect::<Vec<_>>();
         unnamed.extend(self.little(&little));
+        let passed = passed(&causes, &unnamed, self.laws, (&found.screened, &found.imitations));
         let is_named = |(one, other, _): &(usize, usize, f64)| *one < named && *other < named;
         let excess = |power: f64| (power - UNEXPLAINED).max(0.0);
         let sum = |side: usize| found.left.iter().map(|(_, powers)| excess(powers[side])).sum::<f64>();
@@ -105,6 +120,7 @@ impl Terms<'_> {
             unknown: found.unknown,
             correlations: found.correlations.into_iter().filter(is_named).collect(),
             decisions: found.decisions,
+            passed,
             causes,
             unnamed,
         }
@@ -189,6 +205,13 @@ impl Terms<'_> {
 
     /// Returns the parameters of an effect within their bounds.
     fn values(&self, law: &Law, site: Site, unknowns: &[f64], shape: f64, scale: f64) -> Vec<f64> {
+        if law.form.place == Place::Ground {
+            let mut changed = self.robot.clone();
+            apply(&mut changed, law, site, unknowns, shape);
+            let value =
+                if law.effect.name == "ground_friction" { changed.ground_friction } else { changed.contact_time };
+            return clamped(law.effect, vec![value]);
+        }
         if !law.effect.replaces_body() {
             return clamped(law.effect, law.parameters(unknowns, shape, scale));
         }
@@ -220,6 +243,44 @@ impl Terms<'_> {
         }
         intervals
     }
+}
+
+/// Returns why each effect that is no cause is none.
+fn passed(
+    causes: &[Explanation],
+    unnamed: &[Explanation],
+    laws: &[Law],
+    (screened, imitations): (&[Screened], &[(usize, String)]),
+) -> Vec<Passed> {
+    let of_effect = |effect: &'static Effect| {
+        let best = screened.iter().find(|one| laws[one.law].effect == effect);
+        let best = best.map(|one| (one.scope.clone(), one.gain));
+        let imitated = imitations.iter().find(|(law, _)| laws[*law].effect == effect);
+        if let Some((_, scope)) = imitated {
+            let best = Some((scope.clone(), best.map_or(0.0, |(_, gain)| gain)));
+            return Passed {
+                effect,
+                best,
+                reason: "It was found, but a law that the catalogue does not have explains more.",
+            };
+        }
+        if let Some(small) = unnamed.iter().find(|one| one.effect == effect && one.gain != 0.0) {
+            let best = Some((small.scope.clone(), small.gain));
+            let reason = "It belongs to the fit, but it is too uncertain, or not larger than in 95 % of all robots.";
+            return Passed { effect, best, reason };
+        }
+        let reason = match best {
+            Some((_, gain)) if gain > LEAST_GAIN => "Fitted beside the causes, it gains less than the screening says.",
+            Some(_) => "It gains too little: 3 nat are the least.",
+            None => "No equation of this log shows it, or it has the wrong sign.",
+        };
+        Passed { effect, best, reason }
+    };
+    let others = CATALOGUE.into_iter().filter(|effect| causes.iter().all(|cause| cause.effect != *effect));
+    let mut passed: Vec<Passed> = others.map(of_effect).collect();
+    let gain = |one: &Passed| one.best.as_ref().map_or(f64::NEG_INFINITY, |(_, gain)| *gain);
+    passed.sort_by(|one, other| gain(other).total_cmp(&gain(one)));
+    passed
 }
 
 /// Returns a little with the difference between a joint's value and that of all sites, for causes of one value.

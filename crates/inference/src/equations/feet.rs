@@ -4,6 +4,7 @@ use glam::{DMat3, DVec3};
 use twinstep_dynamics::Vec3;
 use twinstep_dynamics::tree::{TreeMotion, TreeParameters, TreeStructure};
 
+use super::ground::Contact;
 use super::measurements::{Measurements, Regime};
 use super::robot::{Robot, Sphere};
 use super::samples::{GRAVITY, Sample};
@@ -12,6 +13,8 @@ use super::samples::{GRAVITY, Sample};
 const SETTLED_S: f64 = 0.02;
 /// Height above the feet below which another part may touch the ground [m]: its roughness.
 const CLEARANCE: f64 = 0.02;
+/// Determinant of the Jacobian below which a leg is stretched [m³].
+const LEAST_DETERMINANT: f64 = 1e-4;
 
 /// Poses of the bodies of a sample, in the frame of the base.
 struct Pose<'a> {
@@ -29,6 +32,21 @@ impl Pose<'_> {
     /// Returns the height of the lowest point of a sphere above the origin of the base [m].
     fn bottom(&self, sphere: &Sphere) -> f64 {
         self.centre(sphere).dot(self.up) - sphere.radius
+    }
+
+    /// Returns the lowest point of a foot; `None` if its leg cannot push it in all directions.
+    fn contact(&self, sphere: &Sphere, (foot, joints): (usize, [usize; 3])) -> Option<Contact> {
+        let point = self.centre(sphere) + self.up.scaled(-sphere.radius);
+        let columns = joints.map(|joint| {
+            let axis = &self.places.bodies[joint + 1].axis;
+            DVec3::from_array((axis.linear + axis.angular.cross(point)).0)
+        });
+        // Jᵀ f = τ.
+        let jacobian = DMat3::from_cols(columns[0], columns[1], columns[2]);
+        let force_per_torque = jacobian.transpose().inverse();
+        let forces = [0, 1, 2].map(|index| force_per_torque.col(index));
+        let point = DVec3::from_array(point.0);
+        (jacobian.determinant().abs() >= LEAST_DETERMINANT).then_some(Contact { foot, point, joints, columns, forces })
     }
 }
 
@@ -62,33 +80,21 @@ impl Sample {
             return false;
         }
         self.base_per_torque = vec![[0.0; 6]; robot.joints.len()];
-        for (foot, _) in feet.iter().zip(standing).filter(|(_, stands)| *stands != Some(false)) {
-            let branch = &structure.branches[foot.body];
-            if branch.len() != 3 {
-                return false;
+        for (index, foot) in feet.iter().enumerate().filter(|(index, _)| standing[*index] != Some(false)) {
+            let Ok(joints) = <[usize; 3]>::try_from(structure.branches[foot.body].as_slice()) else { return false };
+            for joint in joints {
+                self.is_free[joint] = false;
             }
-            for joint in branch {
-                self.is_free[*joint] = false;
+            let contact = pose.contact(foot, (index, joints));
+            if self.regime == Regime::Stand {
+                let Some(contact) = &contact else { return false };
+                for (joint, force) in contact.joints.iter().zip(contact.forces) {
+                    let moment = contact.point.cross(force);
+                    self.base_per_torque[*joint] = [moment.x, moment.y, moment.z, force.x, force.y, force.z];
+                }
             }
-            if self.regime == Regime::Move {
-                continue;
-            }
-            let contact = pose.centre(foot) + pose.up.scaled(-foot.radius);
-            let column = |joint: &usize| {
-                let axis = &pose.places.bodies[joint + 1].axis;
-                DVec3::from_array((axis.linear + axis.angular.cross(contact)).0)
-            };
-            let [a, b, c] = [0, 1, 2].map(|index| column(&branch[index]));
-            // Jᵀ f = τ.
-            let jacobian = DMat3::from_cols(a, b, c);
-            if jacobian.determinant().abs() < 1e-4 {
-                return false;
-            }
-            let force_per_torque = jacobian.transpose().inverse();
-            for (index, joint) in branch.iter().enumerate() {
-                let force = force_per_torque.col(index);
-                let moment = DVec3::from_array(contact.0).cross(force);
-                self.base_per_torque[*joint] = [moment.x, moment.y, moment.z, force.x, force.y, force.z];
+            if let (Some(contact), Some(true)) = (contact, standing[index]) {
+                self.touch(measured, robot, &contact, DVec3::from_array(pose.up.0));
             }
         }
         true

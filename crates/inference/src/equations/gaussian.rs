@@ -384,6 +384,14 @@ impl Scores {
         scores
     }
 
+    /// Returns the products of some candidates with each other that the unknowns do not explain.
+    pub fn products(&self, places: &[usize]) -> DMatrix<f64> {
+        let size = places.len();
+        let row = |one: usize| (0..=one).map(|other| self.product(places[one], places[other])).collect::<Vec<f64>>();
+        let rows: Vec<Vec<f64>> = (0..size).into_par_iter().map(row).collect();
+        DMatrix::from_fn(size, size, |one, other| rows[one.max(other)][one.min(other)])
+    }
+
     /// Returns the product of two candidates that the unknowns do not explain.
     pub fn product(&self, one: usize, other: usize) -> f64 {
         let mut sum = -self.explained[one].dot(&self.explained[other]);
@@ -410,9 +418,9 @@ pub fn gain(
     let lu = inner.lu();
     let posterior = lu.solve(covariance).unwrap_or_else(|| covariance.clone());
     let shift = &posterior * &left;
-    let determinant = lu.determinant().max(1e-300);
+    let log_determinant = lu.u().diagonal().iter().map(|entry| entry.abs().max(1e-300).ln()).sum::<f64>();
     let gain =
-        mean.dot(with_residual) - 0.5 * mean.dot(&(products * mean)) + 0.5 * left.dot(&shift) - 0.5 * determinant.ln();
+        mean.dot(with_residual) - 0.5 * mean.dot(&(products * mean)) + 0.5 * left.dot(&shift) - 0.5 * log_determinant;
     (gain, mean + shift, posterior)
 }
 

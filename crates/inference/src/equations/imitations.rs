@@ -1,66 +1,99 @@
 //! Causes that only imitate another law: functions of what their joints measure explain more, or their own law explains more with a size
 //! that depends on the state.
 
+use std::sync::Arc;
+
+use nalgebra::DVector;
+
+use super::another_law::{AnotherLaw, Term};
 use super::block::Column;
+use super::causes::UnknownLaw;
 use super::fit::Fitted;
-use super::gaussian::{Group, Posterior, posterior};
+use super::gaussian::{Group, Posterior, Scores, posterior};
 use super::law::Place;
-use super::problem::{EFFECT_PROBABILITY, Search, UNKNOWN_PROBABILITY};
-use super::residuals::{Residuals, State};
+use super::problem::{Search, UNKNOWN_PROBABILITY};
+use super::residuals::{Residuals, Small, State};
 use super::search::LEAST_GAIN;
 use super::site::Site;
-use super::unknown;
+use super::unknown::unknown_law;
 
 /// Error of the form of a law of the catalogue, as the size of each function that it lacks, relative to its own.
 const FORM_ERROR: f64 = 0.01;
 /// Standard deviation of the relative change of a law's size with each of [`MODULATORS`]: of a law of the catalogue, and of another one.
-const FORM_CHANGE: [f64; 2] = [0.05, 0.5];
+const FORM_CHANGE: [f64; 2] = [0.03, 0.5];
 /// Least standard deviation of a function of the state; one that changes less is constant.
 const LEAST_CHANGE: f64 = 0.05;
 
+/// What takes the place of a cause.
+pub struct Replacement {
+    /// Its unknowns.
+    groups: Vec<Group>,
+    /// Its description, by joint.
+    laws: Vec<UnknownLaw>,
+    /// By how much it is better than the cause [nat].
+    pub gain: f64,
+}
+
 impl<R: Residuals> Search<'_, R> {
-    /// Removes causes whose law is another one.
+    /// Removes causes whose law is another one. That law stays in the fit, so that no other cause explains it.
+    ///
+    /// Where no functions are known, the cause stays in the fit, and has no name.
     pub fn without_imitations(&mut self, mut best: Fitted<R>) -> Fitted<R> {
         let mut place = 0;
         while place < best.causes.len() {
             let name = self.name(&best.causes[place]);
-            let changing = self.gain_of_changes(&best, place);
-            self.note(format!("  {name} with a size that changes: {changing:.1} nat"));
-            let (without, replaced) = self.replaced(&best, place);
-            if let Some(gain) = replaced {
-                self.note(format!("  another law in place of {name}: {gain:.1} nat"));
+            let mut others = best.causes.clone();
+            let cause = others.remove(place);
+            let without = self.fit(others, &best.small, 2, Some(&best));
+            let changed = self.changed(&best, place);
+            let functions = self.of_functions(&best, &without, place);
+            for (what, found) in [("a size that changes", &changed), ("functions of the state", &functions)] {
+                if let Some(found) = found {
+                    self.note(format!("  {what} in place of {name}: {:.1} nat", found.gain));
+                }
             }
-            if changing > LEAST_GAIN || replaced.is_some_and(|gain| gain > 0.0) {
-                best = without;
-            } else {
+            let changed = changed.filter(|found| found.gain > LEAST_GAIN);
+            let functions = functions.filter(|found| found.gain > 0.0);
+            let Some(law) = functions.or(changed) else {
                 place += 1;
+                continue;
+            };
+            self.imitations.push((cause.law, cause.scope.name.clone()));
+            if self.system.places().is_empty() {
+                // Nothing can take its place: it stays, without a name.
+                place += 1;
+                continue;
             }
+            self.other_laws.extend(law.laws);
+            let small = Small::new(best.small.groups.iter().cloned().chain(law.groups).collect());
+            best = self.fit(without.causes.clone(), &Arc::new(small), 2, Some(&without));
+            // It may have had what another cause leaves.
+            place = 0;
         }
         best
     }
 
-    /// Returns the fit without a cause, and by how much functions of what its joints measure are better in its place; `None` if they
-    /// cannot take it.
-    fn replaced(&self, best: &Fitted<R>, place: usize) -> (Fitted<R>, Option<f64>) {
-        let mut others = best.causes.clone();
-        let cause = others.remove(place);
+    /// Returns functions of what the joints of a cause measure, in its place; `None` if they cannot take it.
+    fn of_functions(&self, best: &Fitted<R>, without: &Fitted<R>, place: usize) -> Option<Replacement> {
+        let cause = &best.causes[place];
         let law = &self.laws[cause.law];
-        let joint_of = |site: &Site| match site {
-            Site::Joint(joint) => Some(*joint),
-            Site::Base => None,
-        };
         let joints: Vec<usize> = cause.scope.sites.iter().filter_map(joint_of).collect();
-        let without = self.fit(others, &best.small, 2, Some(best));
-        if joints.is_empty() || law.form.place == Place::Body {
-            return (without, None);
+        if joints.is_empty() || self.system.places().is_empty() {
+            return None;
         }
-        let functions = |predicted: &R::Predicted, joint: usize| -> Vec<Column> {
-            self.system.functions(predicted, joint, law.form.place).into_iter().map(|(_, column)| column).collect()
-        };
-        let free = joints.iter().map(|joint| Group::independent(functions(&without.predicted, *joint), unknown::STD));
-        let imitated =
-            Self::evidence_with(&without, best, free.collect()) + (EFFECT_PROBABILITY * cause.scope.probability).ln();
-        // A law of the catalogue may have a slightly different form.
+        // What a link has more of is seen in the torque of its joint.
+        let of = if law.form.place == Place::Body { Place::Joint } else { law.form.place };
+        let functions =
+            |predicted: &R::Predicted, joint: usize| -> Vec<Column> { self.system.functions(predicted, joint, of) };
+        let by_joint: Vec<Vec<Column>> = joints.iter().map(|joint| functions(&without.predicted, *joint)).collect();
+        let (free, found) = likeliest(without, &by_joint);
+        if found.terms.is_empty() {
+            return None;
+        }
+        let imitated = Self::evidence_with(without, best, free.clone())
+            + (UNKNOWN_PROBABILITY * cause.scope.probability).ln()
+            + found.log_choices;
+        // A law of the catalogue has its form, or a slightly different one.
         let unknowns = law.form.units.len();
         let near = joints.iter().enumerate().flat_map(|(site, joint)| {
             let columns = &best.groups[place].columns[site * unknowns..(site + 1) * unknowns];
@@ -71,35 +104,58 @@ impl<R: Residuals> Search<'_, R> {
             };
             functions(&best.predicted, *joint).into_iter().map(group)
         });
-        let named = Self::evidence_with(best, best, near.collect());
-        (without, Some(imitated - named))
+        let named = [Vec::new(), near.collect()].map(|near| Self::evidence_with(best, best, near));
+        let named = named[0].max(named[1]);
+        let is_of_drive = matches!(of, Place::Drive | Place::Sensor | Place::Supply);
+        let described = joints.iter().enumerate().map(|(index, joint)| UnknownLaw {
+            gain: imitated - without.evidence,
+            ..unknown_law(&found, index, &self.base.tree.joints[*joint].name, is_of_drive)
+        });
+        Some(Replacement { groups: free, laws: described.collect(), gain: imitated - named })
     }
 
-    /// Returns by how much the law of a cause is better with a size that changes with the state: nothing of the catalogue does that.
-    pub fn gain_of_changes(&self, best: &Fitted<R>, place: usize) -> f64 {
+    /// Returns the law of a cause with a size that changes with the state: nothing of the catalogue does that.
+    pub fn changed(&self, best: &Fitted<R>, place: usize) -> Option<Replacement> {
         let cause = &best.causes[place];
-        let unknowns = self.laws[cause.law].form.units.len();
+        let law = &self.laws[cause.law];
+        let unknowns = law.form.units.len();
         let mut changes = vec![Column::default(); MODULATORS.len()];
         for (index, site) in cause.scope.sites.iter().enumerate() {
             let columns = &best.groups[place].columns[index * unknowns..(index + 1) * unknowns];
             let effect = sum(columns, &cause.values[index]);
-            let joint = match site {
-                Site::Joint(joint) => Some(*joint),
-                Site::Base => None,
-            };
-            for (modulator, change) in MODULATORS.iter().zip(&mut changes) {
-                change.add(&self.modulated(&best.predicted, joint, &effect, *modulator));
+            for ((_, modulator), change) in MODULATORS.iter().zip(&mut changes) {
+                change.add(&self.modulated(&best.predicted, joint_of(site), &effect, *modulator));
             }
         }
-        changes.retain(|change| !change.is_zero());
-        if changes.is_empty() {
-            return f64::NEG_INFINITY;
-        }
+        let (variables, changes): (Vec<&str>, Vec<Column>) = MODULATORS
+            .iter()
+            .map(|(variable, _)| *variable)
+            .zip(changes)
+            .filter(|(_, change)| !change.is_zero())
+            .unzip();
         let count = changes.len();
-        let found = Self::posterior_with(best, best, vec![Group::independent(changes, FORM_CHANGE[0])]);
+        let found = Self::posterior_with(best, best, vec![Group::independent(changes.clone(), FORM_CHANGE[0])]);
         let first = found.mean.len() - count;
-        let gain = |index: usize| gain_of_change(found.mean[index], found.covariance[(index, index)]);
-        (first..first + count).map(gain).fold(f64::NEG_INFINITY, f64::max) + UNKNOWN_PROBABILITY.ln()
+        let gain =
+            |index: usize| gain_of_change(found.mean[first + index], found.covariance[(first + index, first + index)]);
+        let (largest, gain) =
+            (0..count).map(|index| (index, gain(index))).max_by(|one, other| one.1.total_cmp(&other.1))?;
+        let own = best.groups[place].columns.iter().cloned().zip(cause.values.iter().flatten());
+        let own = own.map(|(column, value)| Group::single(column, value.abs().max(law.form.units[0])));
+        let changing = Group::independent(changes, FORM_CHANGE[1]);
+        let name = |site: &Site| joint_of(site).map_or("base", |joint| &self.base.tree.joints[joint].name).to_owned();
+        let described = cause.scope.sites.iter().map(|site| UnknownLaw {
+            joint: name(site),
+            of_drive: matches!(law.form.place, Place::Drive | Place::Sensor | Place::Supply),
+            variable: variables[largest],
+            terms: Vec::new(),
+            gain,
+        });
+        Some(Replacement {
+            groups: own.chain([changing]).collect(),
+            laws: described.collect(),
+            gain: gain + UNKNOWN_PROBABILITY.ln(),
+        })
     }
 
     /// Returns an effect times a function of the state, which has no mean over the effect and a root mean square of one, or less.
@@ -148,6 +204,24 @@ impl<R: Residuals> Search<'_, R> {
     }
 }
 
+/// Returns the functions of joints that explain most together, and their unknowns.
+fn likeliest<R: Residuals>(fit: &Fitted<R>, by_joint: &[Vec<Column>]) -> (Vec<Group>, AnotherLaw) {
+    let (joints, count) = (by_joint.len(), by_joint[0].len());
+    let columns: Vec<&Column> = (0..count).flat_map(|index| by_joint.iter().map(move |all| &all[index])).collect();
+    let groups: Vec<&Group> = fit.small.groups.iter().chain(&fit.groups).collect();
+    let scores = Scores::new(&fit.blocks, &groups, &fit.posterior, &columns);
+    let candidates: Vec<Vec<usize>> =
+        (0..count).map(|function| (function * joints..(function + 1) * joints).collect()).collect();
+    let law = AnotherLaw::most_likely(&scores, &candidates);
+    let group = |term: &Term| Group {
+        columns: by_joint.iter().map(|all| all[term.function].clone()).collect(),
+        mean: DVector::zeros(joints),
+        covariance: term.covariance.clone(),
+        gain: None,
+    };
+    (law.terms.iter().map(group).collect(), law)
+}
+
 /// Returns by how much another law explains a change better than a law of the catalogue [nat], given mean and variance of the change with the
 /// prior of the latter.
 fn gain_of_change(mean: f64, variance: f64) -> f64 {
@@ -165,16 +239,21 @@ fn gain_of_change(mean: f64, variance: f64) -> f64 {
 /// Function of an effect in a row, relative to its root mean square, of time, and of the state of its joint.
 type Modulator = fn(f64, f64, Option<State>) -> f64;
 
-/// Functions with which the size of an effect may change: time, the effect's own size and direction, and the state of the joint.
-const MODULATORS: [Modulator; 7] = [
-    |_, t, _| t,
-    |effect, _, _| effect.abs(),
-    |effect, _, _| effect.signum(),
-    |_, _, state| state.map_or(0.0, |state| state.q),
-    |_, _, state| state.map_or(0.0, |state| state.dq.abs()),
-    |_, _, state| state.map_or(0.0, |state| (state.dq / 0.03).tanh()),
-    |_, _, state| state.map_or(0.0, |state| state.torque.abs()),
+/// Functions with which the size of an effect may change: time, the effect's own size and direction, and the state of the joint; with what
+/// each depends on, as the prefix of a channel of the log.
+const MODULATORS: [(&str, Modulator); 7] = [
+    ("t", |_, t, _| t),
+    ("tau_measured", |effect, _, _| effect.abs()),
+    ("tau_measured", |effect, _, _| effect.signum()),
+    ("q", |_, _, state| state.map_or(0.0, |state| state.q)),
+    ("dq", |_, _, state| state.map_or(0.0, |state| state.dq.abs())),
+    ("dq", |_, _, state| state.map_or(0.0, |state| (state.dq / 0.03).tanh())),
+    ("tau_measured", |_, _, state| state.map_or(0.0, |state| state.torque.abs())),
 ];
+
+fn joint_of(site: &Site) -> Option<usize> {
+    if let Site::Joint(joint) = site { Some(*joint) } else { None }
+}
 
 /// Returns the sum of columns times their values.
 fn sum(columns: &[Column], values: &[f64]) -> Column {

@@ -16,6 +16,8 @@ const REGIME_S: f64 = 0.5;
 const LONGEST_GAP_S: f64 = 0.1;
 /// Usual noise of a gyroscope [rad/s].
 const GYRO_NOISE: f64 = 0.02;
+/// Usual noise of the height of the base [m].
+const HEIGHT_NOISE: f64 = 0.001;
 
 /// What the robot does in a row.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -62,6 +64,10 @@ pub struct BaseRows {
     pub acceleration: Vec<[f64; 3]>,
     /// Velocity in the world frame [m/s]; empty if it was not measured.
     pub velocity: Vec<[f64; 3]>,
+    /// Position in the world frame [m]; empty if it was not measured.
+    pub position: Vec<[f64; 3]>,
+    /// Standard deviation of its noise along the vertical [m].
+    pub height_noise: f64,
 }
 
 /// Measurements of a log.
@@ -212,6 +218,8 @@ fn base_rows(log: &Log, t: &[f64], ranges: &[Range<usize>]) -> Option<BaseRows> 
         gyro,
         acceleration: vectors(log, ["acc_x", "acc_y", "acc_z"]).unwrap_or_default(),
         velocity: vectors(log, ["vel_x", "vel_y", "vel_z"]).unwrap_or_default(),
+        position: vectors(log, ["pos_x", "pos_y", "pos_z"]).unwrap_or_default(),
+        height_noise: log.noise("pos_z").filter(|noise| *noise > 0.0).unwrap_or(HEIGHT_NOISE),
     })
 }
 

@@ -5,14 +5,15 @@
 //! - [`measurements`]: the channels of a log, with less noise by a [`smoother`]; [`robot`]: what effects change.
 //! - [`residuals`]: residuals of a log, and the column of any change of the robot; [`site`]: where changes act.
 //! - [`torque_residuals`]: residuals of a log with torques, without simulation, from [`system`]. [`drive`]: the torque of each drive;
-//!   [`balance`]: the balance of each joint and of the base in [`samples`] of the log, with its [`columns`], on the [`feet`] that stand; the gyroscope.
+//!   [`balance`]: the balance of each joint and of the base in [`samples`] of the log, with its [`columns`], on the [`feet`] that stand; feet on the [`ground`]; the gyroscope.
 //! - [`positions`]: residuals of a log without torques on a fixed base, by simulation; [`small_changes`]: what every robot has a little of.
 //! - [`gaussian`]: the evidence of residuals that are linear in unknowns with normal priors; [`block`]: the noise that is left;
 //!   [`normal`]: unknowns that have a least value.
 //! - [`law`]: an effect with its unknowns. [`nuisance`]: what every robot has a little of.
 //! - [`search`]: the set of causes of highest evidence, by [`screening`] of all effects, a [`fit`] of the best, and its [`refinement`]; [`imitations`]: causes that only imitate
-//!   another law; [`outcome`]: what it found. [`unknown`]: functions that explain what the causes leave.
+//!   another law; [`outcome`]: what it found. [`another_law`]: sums of [`unknown`] functions, that explain more than a cause, or what all causes leave.
 
+mod another_law;
 mod balance;
 mod block;
 mod causes;
@@ -23,6 +24,7 @@ mod explanation;
 mod feet;
 mod fit;
 mod gaussian;
+mod ground;
 mod imitations;
 mod law;
 mod measurements;
@@ -53,4 +55,4 @@ mod unknown;
 
 pub use causes::UnknownLaw;
 pub use explain::{explain, explain_tree, torque_error};
-pub use explanation::{Explained, Explanation, OfJoint};
+pub use explanation::{Explained, Explanation, OfJoint, Passed};

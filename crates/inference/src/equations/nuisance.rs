@@ -6,6 +6,7 @@ use twinstep_model::RigidBody;
 
 use super::block::Column;
 use super::gaussian::Group;
+use super::ground::Touch;
 use super::law::{Law, Place, Presence};
 use super::robot::Robot;
 use super::site::{Site, apply};
@@ -28,6 +29,13 @@ const TORQUE_OFFSET: f64 = 0.02;
 pub const STICK: f64 = 0.1;
 /// Standard deviations of a link's mass, and of its inertia relative to the trace; that of its centre of mass [m].
 pub const BODY: [f64; 3] = [0.03, 0.04, 0.003];
+
+/// Standard deviation of the height of each foot's lowest point on its link [m].
+const FOOT: f64 = 0.002;
+/// Standard deviation of the height of the ground [m], and of its slope in each direction.
+const FLOOR: [f64; 2] = [0.01, 0.03];
+/// Standard deviation of the place in the base whose position was measured, along each axis [m].
+const MARKER: f64 = 0.005;
 
 /// Norm of what a small unknown changes in an equation, relative to the noise of a row, below which the equation does not show it.
 const LEAST_SEEN: f64 = 0.1;
@@ -67,6 +75,7 @@ pub fn of_bodies(system: &System, laws: &[Law], robot: &Robot, predicted: &Predi
     small.extend([0, 1].map(|axis| (system.balance.tilt_column(axis), TILT)));
     small.extend([0, 1, 2].map(|axis| (system.balance.acceleration_column(axis), ACCELERATION)));
     small.extend([0, 1, 2].map(|axis| (system.balance.lever_column(axis), LEVER)));
+    small.extend(ground(system, laws, robot, predicted));
     grouped(system, small)
 }
 
@@ -127,6 +136,26 @@ pub fn add(robot: &mut Robot, law: &Law, joint: usize, unknowns: &[f64], shape: 
         (None, Place::Supply) => robot.voltage_exponent += law.parameters(unknowns, shape, scale)[0],
         (None, _) => apply(robot, law, Site::Joint(joint), unknowns, shape),
     }
+}
+
+/// Returns the unknowns of feet, floor and the measured place of the base.
+fn ground(system: &System, laws: &[Law], robot: &Robot, predicted: &Predicted) -> Vec<(Column, f64)> {
+    let height = |change: &dyn Fn(&Touch) -> f64| system.balance.height_column(change);
+    let mut small = vec![(height(&|_| 1.0), FLOOR[0])];
+    for foot in 0..robot.feet.len() {
+        small.push((height(&|touch| if touch.foot == foot { 1.0 } else { 0.0 }), FOOT));
+    }
+    let touches = || system.balance.samples.iter().flat_map(|sample| &sample.touches);
+    let middle = touches().map(|touch| touch.place).sum::<DVec3>() / touches().count().max(1) as f64;
+    small.extend([0, 1].map(|axis| (height(&|touch| touch.place[axis] - middle[axis]), FLOOR[1])));
+    small.extend([0, 1, 2].map(|axis| (height(&|touch| touch.up[axis]), MARKER)));
+    for law in present(laws, &[Place::Ground]) {
+        let mut after = robot.clone();
+        apply(&mut after, law, Site::Base, &law.form.small[..1], law.shapes[0]);
+        let std = law.small_std(0);
+        small.push((system.column(law, Site::Base, (robot, predicted), &after).scaled(1.0 / std), std));
+    }
+    small
 }
 
 /// Returns the ten inertial unknowns of each body.

@@ -2,16 +2,15 @@
 
 use std::collections::BTreeSet;
 
-use nalgebra::{DMatrix, DVector};
-
+use super::another_law::AnotherLaw;
 use super::block::Column;
 use super::causes::{Found, FoundCause, UnknownLaw};
 use super::fit::Fitted;
-use super::gaussian::{Group, Scores, gain};
+use super::gaussian::{Group, Scores};
 use super::law::Place;
 use super::problem::{Rivals, Search, UNKNOWN_PROBABILITY, power};
 use super::residuals::Residuals;
-use super::unknown;
+use super::unknown::unknown_law;
 
 /// Gain from which a law that the catalogue does not have is reported [nat].
 const LEAST_UNKNOWN: f64 = 10.0;
@@ -73,7 +72,8 @@ impl<R: Residuals> Search<'_, R> {
             let gain = best.evidence - without.evidence;
             let mut found =
                 FoundCause { cause: cause.clone(), gain, stds, site_stds, explained, rivals, is_large: false };
-            found.is_large = self.is_large(&found);
+            let is_imitation = self.imitations.contains(&(cause.law, cause.scope.name.clone()));
+            found.is_large = !is_imitation && self.is_large(&found);
             causes.push(found);
         }
         // Places in the fit.
@@ -102,6 +102,8 @@ impl<R: Residuals> Search<'_, R> {
             little,
             left,
             decisions: std::mem::take(&mut self.decisions),
+            screened: std::mem::take(&mut self.screened),
+            imitations: std::mem::take(&mut self.imitations),
             unknown,
             correlations,
         }
@@ -169,28 +171,25 @@ impl<R: Residuals> Search<'_, R> {
     /// They come after the catalogue: together, they imitate any of its laws.
     fn unknown_laws(&self, best: &Fitted<R>) -> Vec<UnknownLaw> {
         let groups: Vec<&Group> = best.small.groups.iter().chain(&best.groups).collect();
+        let sites =
+            (0..self.base.joints.len()).flat_map(|joint| self.system.places().iter().map(move |place| (joint, *place)));
+        let sites: Vec<(usize, Place)> = sites.collect();
+        let columns = sites.iter().map(|(joint, place)| self.system.functions(&best.predicted, *joint, *place));
+        let columns: Vec<Vec<Column>> = columns.collect();
+        let scores = Scores::new(&best.blocks, &groups, &best.posterior, &columns.iter().flatten().collect::<Vec<_>>());
+        let mut first = 0;
         let mut found = Vec::new();
-        for joint in 0..self.base.joints.len() {
-            for place in self.system.places().iter().copied() {
-                let (variables, columns): (Vec<_>, Vec<Column>) =
-                    self.system.functions(&best.predicted, joint, place).into_iter().unzip();
-                if columns.is_empty() {
-                    continue;
-                }
-                let size = columns.len();
-                let scores = Scores::new(&best.blocks, &groups, &best.posterior, &columns.iter().collect::<Vec<_>>());
-                let with_residual = DVector::from_fn(size, |row, _| scores.with_residual[row]);
-                let products = DMatrix::from_fn(size, size, |row, column| scores.product(row, column));
-                let covariance = DMatrix::identity(size, size) * (unknown::STD * unknown::STD);
-                let (gain, mean, _) = gain(&with_residual, &products, &DVector::zeros(size), &covariance);
-                let gain = gain + UNKNOWN_PROBABILITY.ln();
-                if gain > LEAST_UNKNOWN {
-                    let joint = self.base.tree.joints[joint].name.clone();
-                    let variable = variables[mean.icamax()];
-                    found.push(UnknownLaw { joint, of_drive: place == Place::Drive, variable, gain });
-                }
+        for ((joint, place), columns) in sites.iter().zip(&columns) {
+            let candidates: Vec<Vec<usize>> = (first..first + columns.len()).map(|index| vec![index]).collect();
+            first += columns.len();
+            let law = AnotherLaw::most_likely(&scores, &candidates);
+            let gain = law.gain + UNKNOWN_PROBABILITY.ln();
+            if gain > LEAST_UNKNOWN {
+                let name = &self.base.tree.joints[*joint].name;
+                found.push(UnknownLaw { gain, ..unknown_law(&law, 0, name, *place == Place::Drive) });
             }
         }
+        found.extend(self.other_laws.iter().cloned());
         found.sort_by(|one, other| other.gain.total_cmp(&one.gain));
         found
     }

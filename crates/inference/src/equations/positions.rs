@@ -279,7 +279,7 @@ impl Residuals for Positions {
         &[]
     }
 
-    fn functions(&self, _: &Simulated, _: usize, _: Place) -> Vec<(&'static str, Column)> {
+    fn functions(&self, _: &Simulated, _: usize, _: Place) -> Vec<Column> {
         Vec::new()
     }
 

@@ -1,13 +1,13 @@
 //! What a search for causes works on, and what it remembers.
 
 use super::block::SHAPES;
-use super::causes::{Cause, ScopeSites};
+use super::causes::{Cause, ScopeSites, Screened, UnknownLaw};
 use super::law::Law;
 use super::residuals::Residuals;
 use super::robot::Robot;
 
 /// Prior probability that an effect is a cause.
-pub const EFFECT_PROBABILITY: f64 = 1.0 / 12.0;
+const EFFECT_PROBABILITY: f64 = 1.0 / 12.0;
 
 /// Prior probability that every joint has its own of a usual effect. That they are alike is three times as probable.
 const USUAL_PROBABILITY: f64 = 0.2;
@@ -26,6 +26,12 @@ pub struct Search<'a, R> {
     pub removed: Vec<(usize, String)>,
     /// Candidates that were fitted when a cause was added.
     pub rivals: Vec<Rivals>,
+    /// The best scope of each law in the last screening, with its gain [nat].
+    pub screened: Vec<Screened>,
+    /// Causes in whose place another law explains more: law and scope.
+    pub imitations: Vec<(usize, String)>,
+    /// The laws that explain more.
+    pub other_laws: Vec<UnknownLaw>,
 }
 
 /// Candidates in the place of a cause.
@@ -39,7 +45,18 @@ pub struct Rivals {
 impl<'a, R: Residuals> Search<'a, R> {
     /// Prepares a search for what `base` lacks.
     pub fn new(system: &'a R, laws: &'a [Law], scopes: Vec<ScopeSites>, base: Robot) -> Self {
-        Self { system, laws, scopes, base, decisions: Vec::new(), removed: Vec::new(), rivals: Vec::new() }
+        Self {
+            system,
+            laws,
+            scopes,
+            base,
+            decisions: Vec::new(),
+            removed: Vec::new(),
+            rivals: Vec::new(),
+            screened: Vec::new(),
+            imitations: Vec::new(),
+            other_laws: Vec::new(),
+        }
     }
 
     /// Returns the logarithm of the prior probability of a law on a scope.

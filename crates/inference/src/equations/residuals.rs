@@ -105,8 +105,8 @@ pub trait Residuals: Sync {
     /// Returns the equations that tell laws at a joint apart.
     fn places(&self) -> &[Place];
 
-    /// Returns functions of what a joint measures, in the equations of a law's place, with what each depends on.
-    fn functions(&self, predicted: &Self::Predicted, joint: usize, place: Place) -> Vec<(&'static str, Column)>;
+    /// Returns the columns of [`super::unknown::FUNCTIONS`] at a joint, in the equations of a law's place; none if there are none.
+    fn functions(&self, predicted: &Self::Predicted, joint: usize, place: Place) -> Vec<Column>;
 
     /// Returns the state of a joint at a time of the log [s].
     fn state(&self, predicted: &Self::Predicted, joint: usize, t: f64) -> State;

@@ -7,7 +7,8 @@ use glam::{DQuat, DVec3};
 use twinstep_dynamics::Vec3;
 use twinstep_dynamics::tree::{TreeParameters, TreeState, TreeStructure};
 
-use super::drive::{inverse, link_torque};
+use super::drive::{inverse, link_torque_with, smooth_sign};
+use super::ground::Touch;
 use super::measurements::{JointRows, Measurements, Regime};
 use super::robot::Robot;
 use super::undetermined::Weighting;
@@ -67,14 +68,16 @@ pub struct Sample {
     pub instrument: Motion,
     /// Weights of the rows.
     pub weights: Arc<Vec<f64>>,
-    /// Weights, positions and velocities at some of the rows, by joint: a mean of a law is not the law of a mean.
-    pub states: Vec<Vec<[f64; 3]>>,
+    /// Weights, positions, velocities and their signs as friction has them, at some of the rows, by joint: a mean of a law is not the law of a mean.
+    pub states: Vec<Vec<[f64; 4]>>,
     /// Forces and moments at the base per torque of a joint, by joint: not zero where the limb stands. Empty for a fixed base.
     pub base_per_torque: Vec<[f64; 6]>,
     /// Weights of the balance of the base; `None` for a fixed base.
     pub weighting: Option<Weighting>,
     /// True for a joint whose limb touches nothing, by joint.
     pub is_free: Vec<bool>,
+    /// The feet that stand; on the ground only.
+    pub touches: Vec<Touch>,
     /// True for a joint that turns in one direction all the time, so that its dry friction is known, by joint.
     pub turns: Vec<bool>,
 }
@@ -105,7 +108,9 @@ impl Sample {
 
     /// Returns the mean link torque for a motor torque [N·m] and an acceleration [rad/s²].
     pub fn link_torque_at(&self, robot: &Robot, joint: usize, motor: f64, ddq: f64) -> f64 {
-        let torque = |[weight, q, dq]: &[f64; 3]| weight * link_torque(&robot.joints[joint], motor, [*q, *dq, ddq]);
+        let torque = |[weight, q, dq, sign]: &[f64; 4]| {
+            weight * link_torque_with(&robot.joints[joint], motor, [*q, *dq, ddq], *sign)
+        };
         self.states[joint].iter().map(torque).sum()
     }
 
@@ -215,10 +220,10 @@ fn sample(measured: &Measurements, rows: Range<usize>, regime: Regime, weights: 
     let step = rows.len().div_ceil(MOST_STATES);
     let kept = || rows.clone().zip(weights.iter()).step_by(step);
     let sum_of_weights: f64 = kept().map(|(_, weight)| weight).sum();
-    let states = |joint: &JointRows| -> Vec<[f64; 3]> {
+    let states = |joint: &JointRows| -> Vec<[f64; 4]> {
         let state = |(row, weight): (usize, &f64)| {
             let [q, dq] = [0, 1].map(|of| 0.5 * (joint.smooth[of][row] + joint.smooth[of][row + 1]));
-            [weight / sum_of_weights, q, dq]
+            [weight / sum_of_weights, q, dq, smooth_sign(dq)]
         };
         kept().map(state).collect()
     };
@@ -239,6 +244,7 @@ fn sample(measured: &Measurements, rows: Range<usize>, regime: Regime, weights: 
         states,
         base_per_torque,
         weighting: None,
+        touches: Vec::new(),
         is_free,
         turns,
     })

@@ -4,7 +4,7 @@ use nalgebra::{DMatrix, DVector};
 use twinstep_effects::Target;
 
 use super::block::Column;
-use super::causes::{Cause, ScopeSites};
+use super::causes::{Cause, ScopeSites, Screened};
 use super::fit::Fitted;
 use super::gaussian::{Group, Scores, gain};
 use super::law::Law;
@@ -34,12 +34,25 @@ struct Candidate {
 
 impl<R: Residuals> Search<'_, R> {
     /// Returns the best candidates for a further cause, with their gains at the noise of the current fit.
-    pub fn screen(&self, best: &Fitted<R>) -> Vec<(f64, Cause)> {
-        self.screen_at(best, None)
+    pub fn screen(&mut self, best: &Fitted<R>) -> Vec<(f64, Cause)> {
+        let hypotheses = self.screened(best, None);
+        self.screened.clear();
+        for (gain, cause) in &hypotheses {
+            if !self.screened.iter().any(|one| one.law == cause.law) {
+                let scope = cause.scope.name.clone();
+                self.screened.push(Screened { law: cause.law, scope, gain: *gain });
+            }
+        }
+        self.chosen(hypotheses)
     }
 
     /// Returns the best candidates at some sites, or at all.
     pub fn screen_at(&self, best: &Fitted<R>, only: Option<&[Site]>) -> Vec<(f64, Cause)> {
+        self.chosen(self.screened(best, only))
+    }
+
+    /// Returns every effect on every scope with its gain, the best first.
+    fn screened(&self, best: &Fitted<R>, only: Option<&[Site]>) -> Vec<(f64, Cause)> {
         let candidates = self.candidates(best, only);
         let columns: Vec<&Column> = candidates.iter().map(|candidate| &candidate.column).collect();
         let groups: Vec<&Group> = best.small.groups.iter().chain(&best.groups).collect();
@@ -60,6 +73,11 @@ impl<R: Residuals> Search<'_, R> {
             |cause: &Cause| only.is_none_or(|only| cause.scope.sites.iter().all(|site| only.contains(site)));
         hypotheses.retain(|(_, cause)| is_within(cause));
         hypotheses.sort_by(|one, other| other.0.total_cmp(&one.0));
+        hypotheses
+    }
+
+    /// Returns the hypotheses that are fitted.
+    fn chosen(&self, hypotheses: Vec<(f64, Cause)>) -> Vec<(f64, Cause)> {
         let mut chosen: Vec<(f64, Cause)> = Vec::new();
         for (gain, cause) in hypotheses {
             let effect = self.laws[cause.law].effect.name;
@@ -123,9 +141,9 @@ impl<R: Residuals> Search<'_, R> {
         self.scopes.iter().filter(|_| law.is_cause).filter(move |scope| match law.effect.target {
             Target::Joints => scope.sites.iter().all(|site| *site != Site::Base),
             Target::Supply => scope.name == "all" && scope.sites == [Site::Base],
-            Target::Bodies => scope.name != "all" && scope.sites.len() == 1,
+            Target::Bodies => scope.name != "all" && scope.name != "ground" && scope.sites.len() == 1,
             Target::Imu => scope.name == "base",
-            Target::Ground => false,
+            Target::Ground => scope.name == "ground",
         })
     }
 

@@ -31,6 +31,8 @@ pub fn apply(robot: &mut Robot, law: &Law, site: Site, unknowns: &[f64], shape: 
     match (law.effect.name, site) {
         ("supply_sag", _) => robot.voltage_exponent = values[0],
         ("thermal_derating", Site::Joint(joint)) => robot.thermal[joint] = [values[0], values[1]],
+        ("ground_friction", _) => robot.ground_friction += unknowns[0],
+        ("ground_stiffness", _) => robot.contact_time = robot.contact_time.hypot(values[0]),
         ("gyro_bias", _) => robot.gyro_bias += DVec3::new(values[0], values[1], values[2]),
         ("payload", site) => {
             // The unknowns are mass and first moment, in which forces are nearly linear.

@@ -51,8 +51,10 @@ pub struct Predicted {
     motor: Vec<Vec<f64>>,
     /// At motors that are in balance with the motion, by sample and joint [N·m].
     balanced: Vec<Vec<f64>>,
-    /// Moment and force at the base, and torques of the joints, that the motion needs, by sample.
-    needed: Vec<Vec<f64>>,
+    /// Moment and force at the base, and torques of the joints, that the robot lacks, by sample.
+    lacking: Vec<Vec<f64>>,
+    /// How a link moves differently from its encoder, by joint and sample; empty for a stiff gear.
+    shifts: Vec<Vec<[f64; 3]>>,
 }
 
 impl Predicted {
@@ -131,7 +133,21 @@ impl System {
         let needed = self.balance.needed_by(robot, &shifts);
         let motor: Vec<Vec<f64>> = motor;
         let balanced = self.balance.balanced_motors(robot, &needed, &motor);
-        Predicted { sensed, motor, balanced, needed }
+        let lacking = if self.measured.has_torque {
+            let late = |joint: usize| {
+                if robot.joints[joint].actuator.sensor_delay == self.reference.joints[joint].actuator.sensor_delay {
+                    return Vec::new();
+                }
+                let on_time = self.motor(&self.reference, joint, &sensed[joint]);
+                motor[joint].iter().zip(on_time).map(|(now, before)| now - before).collect()
+            };
+            let late: Vec<Vec<f64>> = (0..robot.joints.len()).map(late).collect();
+            self.balance.lacking_of(robot, &needed, &balanced, &late)
+        } else {
+            let first = if self.first_motors.is_empty() { &motor } else { &self.first_motors };
+            self.balance.lacking_of_drives(robot, &needed, [&motor, first])
+        };
+        Predicted { sensed, motor, balanced, lacking, shifts }
     }
 
     /// Returns the torque at the sensor of a joint for smooth readings, by row [N·m].
@@ -165,20 +181,7 @@ impl System {
                 blocks[*block].y = rows.iter().map(|row| mean(row) - robot.gyro_bias[axis]).collect();
             }
         }
-        let late = |joint: usize| {
-            if robot.joints[joint].actuator.sensor_delay == self.reference.joints[joint].actuator.sensor_delay {
-                return Vec::new();
-            }
-            let on_time = self.motor(&self.reference, joint, &predicted.sensed[joint]);
-            predicted.motor[joint].iter().zip(on_time).map(|(now, before)| now - before).collect()
-        };
-        let late: Vec<Vec<f64>> = (0..robot.joints.len()).map(late).collect();
-        if self.measured.has_torque {
-            self.balance.write_residuals(robot, &predicted.needed, &predicted.balanced, &late, &mut blocks);
-        } else {
-            let motors = [predicted.motor.as_slice(), &self.first_motors];
-            self.balance.write_drive_residuals(robot, &predicted.needed, motors, &mut blocks);
-        }
+        self.balance.write_residuals(robot, &predicted.lacking, &predicted.shifts, &mut blocks);
         blocks
     }
 
@@ -215,6 +218,7 @@ impl System {
             }
             (Place::Body, _) => self.balance.body_column(robot, after),
             (Place::Gyro, _) => self.gyro_column(robot, after),
+            (Place::Ground, _) => self.balance.ground_column(robot, after, &predicted.lacking),
             (_, Site::Base) => Column::default(),
         }
     }

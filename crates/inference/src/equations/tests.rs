@@ -234,7 +234,7 @@ fn gain_of_a_changing_delay(delay: impl Fn(f64) -> f64) -> f64 {
     let cause = Cause { law, scope, shape: 0.0, values: vec![vec![0.25]; 12], log_prior: 0.0 };
     let search = Search::new(&system, &all, Vec::new(), robot);
     let fit = search.fit(vec![cause], &Arc::new(Small::default()), 8, None);
-    search.gain_of_changes(&fit, 0)
+    search.changed(&fit, 0).expect("a delay that acts").gain
 }
 
 #[test]

@@ -63,7 +63,7 @@ impl Residuals for System {
         &[Place::Drive, Place::Joint]
     }
 
-    fn functions(&self, predicted: &Predicted, joint: usize, place: Place) -> Vec<(&'static str, Column)> {
+    fn functions(&self, predicted: &Predicted, joint: usize, place: Place) -> Vec<Column> {
         unknown::columns(self, predicted, joint, place)
     }
 

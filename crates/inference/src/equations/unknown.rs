@@ -1,16 +1,21 @@
-//! Laws that the catalogue does not have: functions of what a joint measures, that explain what the causes leave.
+//! Functions of what a joint measures, of which laws that the catalogue does not have are made.
 
+use super::another_law::{AnotherLaw, Term};
 use super::block::Column;
+use super::causes::UnknownLaw;
 use super::law::Place;
 use super::system::{Predicted, System};
 
-/// Standard deviation of the torque of each function [N·m], root mean square over its rows.
-pub const STD: f64 = 0.2;
+/// Standard deviations of angles, relative to those of torques [rad/(N·m)].
+const ANGLE_PER_TORQUE: f64 = 0.02;
 
 /// A function of what a joint measures.
-struct Function {
+pub struct Function {
     /// What it depends on most, as the prefix of a channel of the log.
-    variable: &'static str,
+    pub variable: &'static str,
+    /// Formula in measurements that are relative to their standard deviations: `q`, `dq`, the position error `e`, the torque `tau`, the
+    /// temperature `T`, and the time `t`.
+    pub formula: &'static str,
     value: fn(&Measured) -> f64,
 }
 
@@ -26,34 +31,50 @@ struct Measured {
     time: f64,
 }
 
-const fn function(variable: &'static str, value: fn(&Measured) -> f64) -> Function {
-    Function { variable, value }
+const fn function(variable: &'static str, formula: &'static str, value: fn(&Measured) -> f64) -> Function {
+    Function { variable, formula, value }
 }
 
-const FUNCTIONS: [Function; 19] = [
-    function("q", |now| now.q),
-    function("q", |now| now.q * now.q),
-    function("q", |now| now.q.powi(3)),
-    function("dq", |now| now.dq),
-    function("dq", |now| now.dq * now.dq.abs()),
-    function("dq", |now| now.dq.max(0.0)),
-    function("dq", |now| (now.speed / 0.03).tanh()),
-    function("dq", |now| (now.speed / 0.03).tanh().max(0.0)),
-    function("dq", |now| now.q * (now.speed / 0.03).tanh()),
-    function("q_error", |now| now.error),
-    function("q_error", |now| now.error * now.error.abs()),
-    function("tau_measured", |now| now.torque),
-    function("tau_measured", |now| now.torque * now.torque.abs()),
-    function("tau_measured", |now| now.torque.max(0.0)),
-    function("tau_measured", |now| now.torque.abs() * (now.speed / 0.03).tanh()),
-    function("temp", |now| now.temperature * now.dq),
-    function("temp", |now| now.temperature * now.torque),
-    function("t", |now| now.time * now.torque),
-    function("t", |now| now.time),
+/// The functions. The first one is constant.
+pub const FUNCTIONS: [Function; 20] = [
+    function("q", "1", |_| 1.0),
+    function("q", "q", |now| now.q),
+    function("q", "q²", |now| now.q * now.q),
+    function("q", "q³", |now| now.q.powi(3)),
+    function("dq", "dq", |now| now.dq),
+    function("dq", "dq |dq|", |now| now.dq * now.dq.abs()),
+    function("dq", "max(dq, 0)", |now| now.dq.max(0.0)),
+    function("dq", "sign(dq)", |now| (now.speed / 0.03).tanh()),
+    function("dq", "max(sign(dq), 0)", |now| (now.speed / 0.03).tanh().max(0.0)),
+    function("dq", "q sign(dq)", |now| now.q * (now.speed / 0.03).tanh()),
+    function("q_error", "e", |now| now.error),
+    function("q_error", "e |e|", |now| now.error * now.error.abs()),
+    function("tau_measured", "tau", |now| now.torque),
+    function("tau_measured", "tau |tau|", |now| now.torque * now.torque.abs()),
+    function("tau_measured", "max(tau, 0)", |now| now.torque.max(0.0)),
+    function("tau_measured", "|tau| sign(dq)", |now| now.torque.abs() * (now.speed / 0.03).tanh()),
+    function("temp", "T dq", |now| now.temperature * now.dq),
+    function("temp", "T tau", |now| now.temperature * now.torque),
+    function("t", "t tau", |now| now.time * now.torque),
+    function("t", "t", |now| now.time),
 ];
 
-/// Returns the columns of the functions at a joint, with what each depends on: on the torque of the drive, or of the link.
-pub fn columns(system: &System, predicted: &Predicted, joint: usize, place: Place) -> Vec<(&'static str, Column)> {
+/// Describes a law at one of its joints. A constant does not tell what the law depends on.
+pub fn unknown_law(law: &AnotherLaw, index: usize, joint: &str, of_drive: bool) -> UnknownLaw {
+    let mut terms: Vec<&Term> = law.terms.iter().collect();
+    terms.sort_by(|one, other| other.mean[index].abs().total_cmp(&one.mean[index].abs()));
+    let of_state = terms.iter().find(|term| term.function > 0).or(terms.first());
+    UnknownLaw {
+        joint: joint.to_owned(),
+        of_drive,
+        variable: of_state.map_or("t", |term| FUNCTIONS[term.function].variable),
+        terms: terms.iter().map(|term| (FUNCTIONS[term.function].formula, term.mean[index], term.std[index])).collect(),
+        gain: law.gain,
+    }
+}
+
+/// Returns the columns of the functions at a joint: of the torque of the drive or of the link, or of the angle between encoder and link.
+pub fn columns(system: &System, predicted: &Predicted, joint: usize, place: Place) -> Vec<Column> {
     let rows = &system.measured.joints[joint];
     let temperature = |row: usize| rows.temperature.get(row).copied().unwrap_or(0.0);
     let of_row = |row: usize| {
@@ -70,10 +91,15 @@ pub fn columns(system: &System, predicted: &Predicted, joint: usize, place: Plac
         let error = rows.command[0][middle] - q;
         [q, dq, error, predicted.balanced(index)[joint], temperature(middle), system.measured.t[middle]]
     };
-    let drive = matches!(place, Place::Drive | Place::Sensor);
     let parts = system.drive_rows(joint);
-    let raw: Vec<[f64; 6]> = if drive {
+    let is_of_rows = matches!(place, Place::Drive | Place::Sensor) && system.measured.has_torque;
+    let raw: Vec<[f64; 6]> = if is_of_rows {
         parts.iter().flat_map(|(_, rows)| rows).map(|row| of_row(*row)).collect()
+    } else if place == Place::Link {
+        (0..system.measured.t.len())
+            .map(of_row)
+            .map(|row| row.map(|cell| if cell.is_finite() { cell } else { 0.0 }))
+            .collect()
     } else {
         (0..samples.len()).map(of_sample).collect()
     };
@@ -82,14 +108,23 @@ pub fn columns(system: &System, predicted: &Predicted, joint: usize, place: Plac
         let values: Vec<f64> = measured.iter().map(function.value).collect();
         let scale = (values.iter().map(|value| value * value).sum::<f64>() / values.len() as f64).sqrt();
         let values: Vec<f64> = values.iter().map(|value| value / scale.max(1e-9)).collect();
-        if !drive {
-            return (function.variable, system.balance.joint_column(joint, &values));
+        if is_of_rows {
+            let mut next = values.into_iter();
+            let parts = parts.iter().map(|(block, rows)| (*block, next.by_ref().take(rows.len()).collect())).collect();
+            return Column { parts };
         }
-        let mut next = values.into_iter();
-        let parts = parts.iter().map(|(block, rows)| (*block, next.by_ref().take(rows.len()).collect())).collect();
-        (function.variable, Column { parts })
+        if place == Place::Link {
+            let shift: Vec<f64> = values.iter().map(|value| ANGLE_PER_TORQUE * value).collect();
+            let motions: Vec<_> = samples.iter().map(|sample| sample.motion(&system.measured, &shift)).collect();
+            return system.balance.motion_column(joint, &motions);
+        }
+        system.balance.joint_column(joint, &values)
     };
-    FUNCTIONS.iter().map(column).filter(|(_, column)| !column.is_zero()).collect()
+    // A constant angle is the offset of an encoder, which the catalogue has.
+    let is_new = |index: &usize| place != Place::Link || *index > 0;
+    (0..FUNCTIONS.len())
+        .map(|index| if is_new(&index) { column(&FUNCTIONS[index]) } else { Column::default() })
+        .collect()
 }
 
 /// Returns the measurements relative to their means (that of the velocity is zero) and standard deviations.

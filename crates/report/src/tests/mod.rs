@@ -58,6 +58,8 @@ fn nothing() -> Diagnosis {
         learned_residual: None,
         next_experiment: None,
         decisions: Vec::new(),
+        not_reported: Vec::new(),
+        promise: None,
         extended_model: "extended.toml".to_owned(),
     }
 }
@@ -124,7 +126,7 @@ fn headline_states_what_the_residual_depends_on() {
     let unexplained = Unexplained {
         fraction: 0.8,
         depends_on: vec!["q_FR_hip".to_owned(), "dq_FR_hip".to_owned()],
-        text: String::new(),
+        ..Unexplained::default()
     };
     let page = page(
         &Diagnosis { unexplained, ..nothing() },
@@ -149,7 +151,8 @@ fn text_from_files_is_never_markup() {
     let (mut diagnosis, extended) = findings();
     let text = || EVIL.to_owned();
     diagnosis.extended_model = text();
-    diagnosis.unexplained = Unexplained { fraction: 0.5, depends_on: vec![text()], text: text() };
+    diagnosis.unexplained =
+        Unexplained { fraction: 0.5, depends_on: vec![text()], text: text(), ..Unexplained::default() };
     diagnosis.confusable[0].effects = [text(), format!("armature@{EVIL}")];
     diagnosis.confusable[0].experiment = text();
     let mut evidence = evidence(&recording(), &extended);

@@ -81,6 +81,7 @@ pub fn findings() -> (Diagnosis, ModelFile) {
         unexplained: Unexplained {
             fraction: 0.14,
             depends_on: vec!["q_FR_hip".to_owned()],
+            law: Vec::new(),
             text: "The residual is above the noise at the front right hip, near its joint limit.".to_owned(),
         },
         learned_residual: None,
@@ -95,6 +96,8 @@ pub fn findings() -> (Diagnosis, ModelFile) {
                 .to_owned(),
         }),
         decisions: Vec::new(),
+        not_reported: Vec::new(),
+        promise: None,
         extended_model: "extended.toml".to_owned(),
     };
     (diagnosis, extended)
