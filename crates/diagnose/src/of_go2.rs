@@ -58,17 +58,17 @@ pub fn diagnose(
     let corrected = extended.robot_model()?;
     let lacks_torque = evidence.residual_power(simulator, &corrected).shows_missing_torque(LEAST_EXCESS);
     let [baseline, after] = [&robot, &corrected].map(|robot| errors(logs, &held_out, robot, simulator));
+    let joints = JOINT_NAMES.map(str::to_owned);
     let promise = if extended.effects == model.effects {
         None
     } else {
-        promise(logs, &held_out, (&robot, &extended), simulator, &mut say)?
+        promise(logs, &held_out, (&robot, &extended), &joints, simulator, &mut say)?
     };
     say("choosing the next experiment")?;
     let confusable = confusable(&found);
     let ambiguous: Vec<(Hypothesis, Vec<Hypothesis>)> = found.causes.iter().map(hypotheses).collect();
     let pairs = experiment_design::pairs(&extended, &ambiguous, &confusable);
     let next = experiment_design::next_motion(&pairs, &evidence, &robot, simulator);
-    let joints = JOINT_NAMES.map(str::to_owned);
     let gains = joints.iter().cloned().zip(found.gains.iter().copied());
     let diagnosis = Diagnosis {
         baseline: baseline?,

@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 use twinstep_effects::{ModelFile, RobotSampler};
 use twinstep_identify::evaluate::position_errors;
 use twinstep_logs::Log;
-use twinstep_model::{JOINT_NAMES, NUM_JOINTS, RobotModel, Rollout, stream};
+use twinstep_model::{RobotModel, Rollout, stream};
 
 use super::findings::{Promise, Reduction};
 use super::{DiagnoseError, ExperimentError};
@@ -19,16 +19,19 @@ const DRAWS: usize = 24;
 /// Blocks of the fitted rows whose errors are compared.
 const BLOCKS: usize = 8;
 
-/// Errors of each joint with their rows.
-type Errors = [Vec<(usize, f64)>; NUM_JOINTS];
+/// Rows and errors of a joint.
+type JointErrors = Vec<(usize, f64)>;
+/// Errors of each joint.
+type Errors = Vec<JointErrors>;
 
 /// Predicts the reduction on the held-out rows of logs, and compares it with what is found there; `None` if no positions are compared.
 ///
-/// `say` gets the step, and ends the prediction by an error.
+/// `names` are those of the joints. `say` gets the step, and ends the prediction by an error.
 pub fn promise(
     logs: &[Log],
     held_out: &[Vec<bool>],
     (given, extended): (&RobotModel, &ModelFile),
+    names: &[String],
     simulator: &mut dyn Rollout,
     say: &mut dyn FnMut(&str) -> Result<(), DiagnoseError>,
 ) -> Result<Option<Promise>, DiagnoseError> {
@@ -36,7 +39,7 @@ pub fn promise(
     let Ok(sampler) = RobotSampler::new(extended.clone()) else { return Ok(None) };
     let mut errors = |robot: &RobotModel, is_held_out: bool| -> Result<Vec<Errors>, ExperimentError> {
         let of = |(log, held_out): (&Log, &Vec<bool>)| {
-            position_errors(log, robot, simulator, |row| held_out[row] == is_held_out)
+            Ok(position_errors(log, robot, simulator, |row| held_out[row] == is_held_out)?.to_vec())
         };
         logs.iter().zip(held_out).map(of).collect()
     };
@@ -48,25 +51,25 @@ pub fn promise(
         return Ok(None);
     }
     let mut random = stream(0, "promise", 0);
-    let mut draws: Vec<[[Squares; NUM_JOINTS]; 2]> = Vec::new();
+    let mut draws: Vec<[Vec<Squares>; 2]> = Vec::new();
     for draw in 0..DRAWS {
         say("predicting the gain")?;
         let drawn = errors(&sampler.sample(&mut random), true)?;
         let floor = joints(&left, Some(draw % BLOCKS));
         draws.push([&before, &after].map(|model| {
             let differences = joints(&differences(model, &drawn), None);
-            std::array::from_fn(|joint| differences[joint].above(&floor[joint]))
+            differences.iter().zip(&floor).map(|(one, floor)| one.above(floor)).collect()
         }));
     }
-    let reduction = |of: &dyn Fn(&[Squares; NUM_JOINTS]) -> Squares| {
+    let reduction = |of: &dyn Fn(&[Squares]) -> Squares| {
         let mut all: Vec<f64> = draws.iter().map(|draw| 1.0 - of(&draw[1]).root() / of(&draw[0]).root()).collect();
         all.sort_by(f64::total_cmp);
         let found = 1.0 - of(&measured[1]).root() / of(&measured[0]).root();
         Reduction { predicted: quantile(&all, 0.5), interval: [quantile(&all, 0.05), quantile(&all, 0.95)], found }
     };
-    let by_joint = (0..NUM_JOINTS).filter(|joint| measured[0][*joint].count > 0.0);
+    let by_joint = (0..names.len()).filter(|joint| measured[0][*joint].count > 0.0);
     let by_joint: BTreeMap<String, Reduction> =
-        by_joint.map(|joint| (JOINT_NAMES[joint].to_owned(), reduction(&|squares| squares[joint]))).collect();
+        by_joint.map(|joint| (names[joint].clone(), reduction(&|squares| squares[joint]))).collect();
     Ok(Some(Promise { all: reduction(&|squares| squares.iter().fold(Squares::default(), Squares::plus)), by_joint }))
 }
 
@@ -93,8 +96,8 @@ impl Squares {
 }
 
 /// Returns the squares of each joint in all rows, or in one of the blocks.
-fn joints(errors: &[Errors], block: Option<usize>) -> [Squares; NUM_JOINTS] {
-    std::array::from_fn(|joint| {
+fn joints(errors: &[Errors], block: Option<usize>) -> Vec<Squares> {
+    let of_joint = |joint: usize| {
         let of_log = |errors: &Errors| {
             let rows = &errors[joint];
             let range =
@@ -103,16 +106,17 @@ fn joints(errors: &[Errors], block: Option<usize>) -> [Squares; NUM_JOINTS] {
             Squares { sum: rows.iter().map(|(_, error)| error * error).sum(), count: rows.len() as f64 }
         };
         errors.iter().map(of_log).fold(Squares::default(), |sum, one| sum.plus(&one))
-    })
+    };
+    (0..errors.first().map_or(0, Vec::len)).map(of_joint).collect()
 }
 
 /// Returns how a simulation differs from another one of the same rows.
 fn differences(one: &[Errors], other: &[Errors]) -> Vec<Errors> {
     let of_log = |(one, other): (&Errors, &Errors)| {
-        std::array::from_fn(|joint| {
-            let pairs = one[joint].iter().zip(&other[joint]);
-            pairs.map(|((row, one), (_, other))| (*row, one - other)).collect()
-        })
+        let of_joint = |(one, other): (&JointErrors, &JointErrors)| {
+            one.iter().zip(other).map(|((row, one), (_, other))| (*row, one - other)).collect()
+        };
+        one.iter().zip(other).map(of_joint).collect()
     };
     one.iter().zip(other).map(of_log).collect()
 }
@@ -131,9 +135,9 @@ mod tests {
     #[test]
     fn what_is_left_is_in_both_errors() {
         let rows = |errors: &[f64]| errors.iter().copied().enumerate().collect::<Vec<_>>();
-        let mut errors: Errors = Default::default();
+        let mut errors: Errors = vec![Vec::new(); 4];
         errors[3] = rows(&[3.0, -3.0, 3.0, -3.0, 3.0, -3.0, 3.0, -3.0]);
-        let mut floor: Errors = Default::default();
+        let mut floor: Errors = vec![Vec::new(); 4];
         floor[3] = rows(&[4.0; 16]);
         let [errors, floor] = [joints(&[errors], None), joints(&[floor], Some(7))];
         assert_eq!(floor[3].count, 2.0);

@@ -21,8 +21,10 @@ pub enum Place {
     Body,
     /// The gyroscope.
     Gyro,
-    /// Feet on the ground.
-    Ground,
+    /// The force on feet that slide.
+    Slip,
+    /// The height of feet that stand.
+    Sink,
 }
 
 /// Where every joint has a little of an effect, too little to report.

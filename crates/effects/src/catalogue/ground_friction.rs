@@ -39,7 +39,7 @@ pub const EFFECT: Effect = Effect {
         law: [PlotQuantity::Time, PlotQuantity::LateralAcceleration],
     },
     blind_test: None,
-    laws: &[LawForm::new(Place::Ground, &[0.3], |c, _| vec![0.8 + c[0]]).with_small(&[0.05], Presence::Torques)],
+    laws: &[LawForm::new(Place::Slip, &[0.3], |c, _| vec![0.8 + c[0]]).with_small(&[0.05], Presence::Torques)],
     amount: None,
     apply: Apply::Robot(|robot, _, values| {
         robot.contact.friction = values[0];

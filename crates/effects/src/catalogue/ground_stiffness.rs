@@ -42,7 +42,7 @@ pub const EFFECT: Effect = Effect {
     },
     blind_test: Some(&[BlindTestCondition::FloatingBase]),
     // Feet sink in proportion to the square of the time constant.
-    laws: &[LawForm::positive(Place::Ground, &[0.5], |c, _| vec![0.04 * c[0].max(0.0025).sqrt()])
+    laws: &[LawForm::positive(Place::Sink, &[0.5], |c, _| vec![0.04 * c[0].max(0.0025).sqrt()])
         .with_small(&[0.03], Presence::Torques)],
     amount: None,
     apply: Apply::Robot(|robot, _, values| {

@@ -11,10 +11,10 @@ use twinstep_dynamics::tree::{TreeAcceleration, TreeMotion, TreeParameters, Tree
 use twinstep_model::Foot;
 
 use super::block::Block;
-use super::ground::Touch;
 use super::measurements::{Measurements, Regime};
 use super::robot::Robot;
 use super::samples::{GRAVITY, Motion, Sample, samples, weights};
+use super::touch::Touch;
 use super::undetermined::Weighting;
 
 /// Error of the height of a foot, by the orientation of the base and the shape of the foot [m].

@@ -7,10 +7,10 @@ use twinstep_model::{RigidBody, RobotTree};
 
 use super::balance::Balance;
 use super::block::Column;
-use super::ground::Touch;
 use super::measurements::Regime;
 use super::robot::Robot;
 use super::samples::Sample;
+use super::touch::Touch;
 
 impl Balance {
     /// Returns the column of a change of the torque on a joint's link, by sample [N·m].

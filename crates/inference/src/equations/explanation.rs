@@ -205,12 +205,15 @@ impl Terms<'_> {
 
     /// Returns the parameters of an effect within their bounds.
     fn values(&self, law: &Law, site: Site, unknowns: &[f64], shape: f64, scale: f64) -> Vec<f64> {
-        if law.form.place == Place::Ground {
+        let of_ground: Option<fn(&Robot) -> f64> = match law.form.place {
+            Place::Slip => Some(|robot| robot.ground_friction),
+            Place::Sink => Some(|robot| robot.contact_time),
+            _ => None,
+        };
+        if let Some(value) = of_ground {
             let mut changed = self.robot.clone();
             apply(&mut changed, law, site, unknowns, shape);
-            let value =
-                if law.effect.name == "ground_friction" { changed.ground_friction } else { changed.contact_time };
-            return clamped(law.effect, vec![value]);
+            return clamped(law.effect, vec![value(&changed)]);
         }
         if !law.effect.replaces_body() {
             return clamped(law.effect, law.parameters(unknowns, shape, scale));

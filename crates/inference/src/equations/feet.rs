@@ -4,10 +4,10 @@ use glam::{DMat3, DVec3};
 use twinstep_dynamics::Vec3;
 use twinstep_dynamics::tree::{TreeMotion, TreeParameters, TreeStructure};
 
-use super::ground::Contact;
 use super::measurements::{Measurements, Regime};
 use super::robot::{Robot, Sphere};
 use super::samples::{GRAVITY, Sample};
+use super::touch::Contact;
 
 /// Time before and after a sample in which a foot neither touches down nor lifts off [s].
 const SETTLED_S: f64 = 0.02;

@@ -5,7 +5,7 @@
 //! - [`measurements`]: the channels of a log, with less noise by a [`smoother`]; [`robot`]: what effects change.
 //! - [`residuals`]: residuals of a log, and the column of any change of the robot; [`site`]: where changes act.
 //! - [`torque_residuals`]: residuals of a log with torques, without simulation, from [`system`]. [`drive`]: the torque of each drive;
-//!   [`balance`]: the balance of each joint and of the base in [`samples`] of the log, with its [`columns`], on the [`feet`] that stand; feet on the [`ground`]; the gyroscope.
+//!   [`balance`]: the balance of each joint and of the base in [`samples`] of the log, with its [`columns`], on the [`feet`] that stand; each [`touch`] of a foot on the [`ground`]; the gyroscope.
 //! - [`positions`]: residuals of a log without torques on a fixed base, by simulation; [`small_changes`]: what every robot has a little of.
 //! - [`gaussian`]: the evidence of residuals that are linear in unknowns with normal priors; [`block`]: the noise that is left;
 //!   [`normal`]: unknowns that have a least value.
@@ -50,6 +50,7 @@ mod system;
 #[cfg(test)]
 mod tests;
 mod torque_residuals;
+mod touch;
 mod undetermined;
 mod unknown;
 

@@ -6,11 +6,11 @@ use twinstep_model::RigidBody;
 
 use super::block::Column;
 use super::gaussian::Group;
-use super::ground::Touch;
 use super::law::{Law, Place, Presence};
 use super::robot::Robot;
 use super::site::{Site, apply};
 use super::system::{Predicted, System};
+use super::touch::Touch;
 
 /// Standard deviation of the friction at low speed [N·m], for two speeds [rad/s].
 const LOW_SPEED: [(f64, f64); 2] = [(0.04, 0.2), (0.03, 0.8)];
@@ -149,7 +149,7 @@ fn ground(system: &System, laws: &[Law], robot: &Robot, predicted: &Predicted) -
     let middle = touches().map(|touch| touch.place).sum::<DVec3>() / touches().count().max(1) as f64;
     small.extend([0, 1].map(|axis| (height(&|touch| touch.place[axis] - middle[axis]), FLOOR[1])));
     small.extend([0, 1, 2].map(|axis| (height(&|touch| touch.up[axis]), MARKER)));
-    for law in present(laws, &[Place::Ground]) {
+    for law in present(laws, &[Place::Slip, Place::Sink]) {
         let mut after = robot.clone();
         apply(&mut after, law, Site::Base, &law.form.small[..1], law.shapes[0]);
         let std = law.small_std(0);

@@ -8,9 +8,9 @@ use twinstep_dynamics::Vec3;
 use twinstep_dynamics::tree::{TreeParameters, TreeState, TreeStructure};
 
 use super::drive::{inverse, link_torque_with, smooth_sign};
-use super::ground::Touch;
 use super::measurements::{JointRows, Measurements, Regime};
 use super::robot::Robot;
+use super::touch::Touch;
 use super::undetermined::Weighting;
 
 /// Gravitational acceleration [m/s²].

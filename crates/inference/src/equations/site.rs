@@ -3,7 +3,7 @@
 use glam::{DMat3, DVec3};
 use twinstep_effects::Apply;
 
-use super::law::Law;
+use super::law::{Law, Place};
 use super::robot::Robot;
 
 /// Mass above which a payload changes the inertia of a body, too [kg], if it is no farther from the body's origin than this [m].
@@ -28,11 +28,14 @@ pub fn apply(robot: &mut Robot, law: &Law, site: Site, unknowns: &[f64], shape: 
     }
     let scale = if let Site::Joint(joint) = site { robot.scale[joint] } else { 1.0 };
     let values = law.parameters(unknowns, shape, scale);
+    match law.form.place {
+        Place::Slip => robot.ground_friction += unknowns[0],
+        Place::Sink => robot.contact_time = robot.contact_time.hypot(values[0]),
+        _ => {}
+    }
     match (law.effect.name, site) {
         ("supply_sag", _) => robot.voltage_exponent = values[0],
         ("thermal_derating", Site::Joint(joint)) => robot.thermal[joint] = [values[0], values[1]],
-        ("ground_friction", _) => robot.ground_friction += unknowns[0],
-        ("ground_stiffness", _) => robot.contact_time = robot.contact_time.hypot(values[0]),
         ("gyro_bias", _) => robot.gyro_bias += DVec3::new(values[0], values[1], values[2]),
         ("payload", site) => {
             // The unknowns are mass and first moment, in which forces are nearly linear.

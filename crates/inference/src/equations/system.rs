@@ -218,7 +218,7 @@ impl System {
             }
             (Place::Body, _) => self.balance.body_column(robot, after),
             (Place::Gyro, _) => self.gyro_column(robot, after),
-            (Place::Ground, _) => self.balance.ground_column(robot, after, &predicted.lacking),
+            (Place::Slip | Place::Sink, _) => self.balance.ground_column(robot, after, &predicted.lacking),
             (_, Site::Base) => Column::default(),
         }
     }
