@@ -64,6 +64,10 @@ fn hidden_friction_is_found_with_its_scope_and_size_and_the_extended_model_fits(
     assert!(cause.score_nats > cause.threshold_nats);
     let [before, after] = [diagnosis.baseline, diagnosis.extended].map(|errors| errors.q_rmse_rad.unwrap());
     assert!(after < 0.4 * before, "{before} -> {after} rad on held-out seconds");
+    let promise = diagnosis.promise.expect("positions are compared").all;
+    let [low, high] = promise.interval;
+    assert!((promise.found - (1.0 - after / before)).abs() < 0.02, "{promise:?}");
+    assert!(low <= promise.found && promise.found <= high && high - low < 0.3, "{promise:?}");
     check_in_a_browser(&folder.path().join("diagnosis/report.html"));
     for motion in ["motion_before.html", "motion_after.html"] {
         let page = std::fs::read_to_string(folder.path().join("diagnosis").join(motion)).unwrap();
@@ -228,8 +232,9 @@ fn gains_that_differ_from_joint_to_joint_are_in_the_extended_model_and_no_cause(
     let log = folder.path().join("log.parquet");
     with_motor_torques(&log_of(&robot), |joint, [p, d]| kp[joint] * p + d).write(&log).unwrap();
     let out = folder.path().join("diagnosis");
-    let output = twinstep(&["diagnose", log.to_str().unwrap(), "--out", out.to_str().unwrap()]);
+    let output = twinstep(&["diagnose", log.to_str().unwrap(), "--out", out.to_str().unwrap(), "--explain"]);
     let printed = String::from_utf8_lossy(&output.stdout);
+    assert!(printed.contains("no cause: -") && printed.contains("It gains too little"), "{printed}");
     assert!(
         output.status.success() && printed.contains("the gains of the joints differ, kp by factors of 0.9"),
         "{printed}"

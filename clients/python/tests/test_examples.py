@@ -1,14 +1,18 @@
 """All examples run."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import twinstep
+from twinstep.exploration import evaluate_exploration
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
+ROOT = EXAMPLES.parents[2]
 
 
 def run(name: str, *arguments: str) -> str:
@@ -49,3 +53,24 @@ def test_rsl_rl_trains_a_policy(tmp_path: Path) -> None:
     printed = run("ppo_rsl_rl.py", "--envs", "4", "--steps", "192", "--out", str(tmp_path))
     assert "192 steps" in printed
     assert "velocity error" in printed
+
+
+def test_exploration_policies_are_trained_by_either_library(tmp_path: Path) -> None:
+    pytest.importorskip("stable_baselines3")
+    pytest.importorskip("rsl_rl")
+    # The networks of the ensemble's own tests, as the actuators of a Go2.
+    ensemble = ROOT / "ensemble/golden/actuators.safetensors"
+    model = tmp_path / "robot.toml"
+    model.write_text(f'robot = "go2"\n[actuator]\nmode = "replace"\nensemble = "{ensemble}"\n')
+    base = ROOT / "data/policies/walk.safetensors"
+    for name in ("explore_sb3.py", "explore_rsl_rl.py"):
+        robot = ("--model", str(model), "--base", str(base))
+        printed = run(name, *robot, "--envs", "4", "--steps", "192", "--out", str(tmp_path / name))
+        measured = re.search(r"192 steps in .*: uncertainty ([\d.]+) nat, [\d.]+ falls", printed)
+        assert measured, printed
+        assert float(measured[1]) > 0.0
+
+
+def test_task_without_uncertainty_is_no_exploration() -> None:
+    with pytest.raises(twinstep.SpecMismatchError, match="epistemic_uncertainty"):
+        evaluate_exploration(lambda obs: np.zeros((len(obs), 12), np.float32), 2, task="walk")

@@ -16,7 +16,7 @@ use twinstep_policy::{Policy, PolicyRunner};
 use twinstep_report::{film_strip, joint_plot, joint_table};
 use twinstep_sim::BatchRollout;
 
-use twinstep_workflows::{DiagnoseOptions, TrainConfig, TrainOptions};
+use twinstep_workflows::{DiagnoseOptions, TrainConfig, TrainOptions, progress_lines};
 
 use crate::diagnose::diagnose_and_print;
 use crate::exit::{CommandResult, Signals, input, other};
@@ -76,7 +76,7 @@ fn walk(args: &Args, policy: &Path, signals: &Signals) -> CommandResult {
     let mut obs = env.reset(&ResetRequest::seeded(1, num_envs)).map_err(other)?.to_vec();
     let dt = env.spec().policy_dt;
     let steps = (f64::from(args.seconds) / dt) as u64;
-    let bar = ProgressBar::new(steps * num_envs as u64).with_style(
+    let bar = ProgressBar::with_draw_target(Some(steps * num_envs as u64), progress_lines::target()).with_style(
         ProgressStyle::with_template("   {bar:32} {pos}/{len} env-steps  {per_sec}  ETA {eta}")
             .expect("the template is valid"),
     );

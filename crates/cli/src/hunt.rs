@@ -5,6 +5,7 @@ use std::process::Command;
 
 use indicatif::{ProgressBar, ProgressStyle};
 use twinstep_hunt::{HuntConfig, HuntError, Plant, Suite, hunt};
+use twinstep_workflows::progress_lines;
 
 use crate::exit::{CommandResult, Failure, Signals, input, other};
 
@@ -91,7 +92,8 @@ pub fn run(args: &Args) -> CommandResult {
     };
     let signals = Signals::listen()?;
     let style = ProgressStyle::with_template("{bar:30} {pos}/{len} cases, {per_sec}, ETA {eta}  {msg}");
-    let bar = ProgressBar::new(args.cases).with_style(style.expect("a template"));
+    let bar = ProgressBar::with_draw_target(Some(args.cases), progress_lines::target())
+        .with_style(style.expect("a template"));
     let plant = match args.plant {
         PlantName::Rapier => Plant::Rapier,
         PlantName::Mujoco => Plant::Mujoco,

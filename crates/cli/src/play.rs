@@ -10,6 +10,7 @@ use twinstep_logs::Log;
 use twinstep_logs::replay::at_log_rate;
 use twinstep_model::{Actuator, BaseMount, RobotModel};
 use twinstep_sim::{BatchBackend, Engine, MujocoBackend, MujocoPlant, RapierBackend, SimConfig};
+use twinstep_workflows::progress_lines;
 
 use crate::exit::{CommandResult, Failure, Signals, input, other};
 use crate::serve::engine;
@@ -81,7 +82,7 @@ pub fn run(args: &Args) -> CommandResult {
     let learned = learned.map(at_rate).transpose().map_err(input)?;
     let actuators = || learned.as_ref().map(|learned| Box::new(learned.actuators(1, false)) as Box<dyn Actuator>);
     let signals = Signals::listen()?;
-    let bar = ProgressBar::new(motion.rows() as u64);
+    let bar = ProgressBar::with_draw_target(Some(motion.rows() as u64), progress_lines::target());
     let result = play(&motion, &robot, &actuators, config, args.base, &mut |row| {
         bar.set_position(row as u64);
         !signals.check().unwrap_or(true)

@@ -114,17 +114,26 @@ pub struct Promise {
     pub all: Reduction,
     /// Of each joint, by name.
     pub by_joint: BTreeMap<String, Reduction>,
+    /// In each motion, by the name of its segments.
+    pub by_motion: BTreeMap<String, Reduction>,
 }
 
 /// Reduction of an error: 1 − RMSE after / RMSE before.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Reduction {
-    /// Median of what the intervals of the extended model predict.
+    /// Median of the prediction; negative if the error is expected to grow.
     pub predicted: f64,
     /// 90 % interval.
     pub interval: [f64; 2],
     /// What was found.
     pub found: f64,
+}
+
+impl Reduction {
+    /// Returns the relative change of the error: predicted, both ends of the 90 % interval, the lower one first, and found.
+    pub fn changes(&self) -> [f64; 4] {
+        [self.predicted, self.interval[1], self.interval[0], self.found].map(|reduction| -reduction)
+    }
 }
 
 /// Root mean square errors; null if they were not measured.

@@ -59,10 +59,11 @@ pub fn diagnose(
     let lacks_torque = evidence.residual_power(simulator, &corrected).shows_missing_torque(LEAST_EXCESS);
     let [baseline, after] = [&robot, &corrected].map(|robot| errors(logs, &held_out, robot, simulator));
     let joints = JOINT_NAMES.map(str::to_owned);
+    say("predicting the gain")?;
     let promise = if extended.effects == model.effects {
         None
     } else {
-        promise(logs, &held_out, (&robot, &extended), &joints, simulator, &mut say)?
+        promise(logs, &held_out, [&robot, &corrected], &joints, simulator)?
     };
     say("choosing the next experiment")?;
     let confusable = confusable(&found);

@@ -5,7 +5,7 @@
 use twinstep_model::JointModel;
 
 /// Equations that an effect changes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Place {
     /// The torque at the motor-current sensor.
     Drive,

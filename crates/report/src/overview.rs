@@ -1,6 +1,6 @@
 //! Upper part of the page: headline, errors, and the joints and times at which they are largest.
 
-use twinstep_diagnose::{Diagnosis, RmsErrors};
+use twinstep_diagnose::{Diagnosis, Promise, RmsErrors};
 use twinstep_identify::{Evaluation, JointEvaluation};
 use twinstep_model::{Joint, JointKind, Leg};
 
@@ -37,10 +37,33 @@ pub fn numbers(diagnosis: &Diagnosis) -> String {
          <thead><tr><th></th><th>given model</th><th>extended model</th><th>noise floor</th><th>reduction</th></tr>\
          </thead>\n<tbody>\n{}{}</tbody></table></div>\n\
          <p class=\"note\">Root mean squares on the held-out blocks, which take no part in any selection or fit. A \
-         dash: not measured in this log. The noise floor is the error due to sensor noise alone.</p>\n</section>\n",
+         dash: not measured in this log. The noise floor is the error due to sensor noise alone.</p>\n{}</section>\n",
         row("joint position, closed loop [rad]", |errors| errors.q_rmse_rad),
-        row("torque at the sensor [N·m]", |errors| errors.torque_rmse_nm)
+        row("torque at the sensor [N·m]", |errors| errors.torque_rmse_nm),
+        diagnosis.promise.as_ref().map_or(String::new(), promise)
     )
+}
+
+/// Returns the paragraph on the predicted change of the error.
+fn promise(promise: &Promise) -> String {
+    let [predicted, low, high, found] = promise.all.changes().map(signed_percent);
+    format!(
+        "<p>The laws alone change the error of the joint positions by <strong>{found}</strong>. The prediction, made from \
+         the fitted rows before this was measured, was {predicted} (90 % interval {low} to {high}).</p>\n"
+    )
+}
+
+/// Returns a relative change as text.
+fn signed_percent(change: f64) -> String {
+    let percent = (100.0 * change).round();
+    let sign = if percent > 0.0 {
+        "+"
+    } else if percent < 0.0 {
+        "−"
+    } else {
+        ""
+    };
+    format!("{sign}{:.0} %", percent.abs())
 }
 
 /// Returns heat maps of the joints' errors under both models.

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use twinstep_diagnose::{Diagnosis, ParameterValue, Promise, Reduction, RmsErrors};
+use twinstep_diagnose::{Diagnosis, ParameterValue, Promise, RmsErrors};
 
 use crate::ambiguous_effects;
 
@@ -68,12 +68,11 @@ pub fn why(diagnosis: &Diagnosis) -> String {
     lines.join("\n") + "\n"
 }
 
-/// Returns the line on the predicted reduction of the error.
+/// Returns the line on the predicted change of the error.
 fn promise(promise: &Promise) -> String {
-    let Reduction { predicted, interval: [low, high], found } = promise.all;
-    let [predicted, low, high, found] = [predicted, low, high, found].map(|share| 100.0 * share);
+    let [predicted, low, high, found] = promise.all.changes().map(|change| 100.0 * change);
     format!(
-        "    the laws alone: a reduction by {predicted:.0} % was predicted (90 % interval {low:.0} to {high:.0} %), {found:.0} % was found"
+        "    by the laws alone: {found:+.0} %; predicted before it was measured: {predicted:+.0} % (90 % interval {low:+.0} to {high:+.0} %)"
     )
 }
 

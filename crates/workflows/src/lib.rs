@@ -42,6 +42,7 @@ pub mod measure_tables;
 pub mod observer;
 pub mod open_log;
 pub mod player;
+pub mod progress_lines;
 mod random_commands;
 pub mod record;
 pub mod rehearsal;

@@ -4,9 +4,10 @@ use std::fmt::Display;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use crate::failure::Failure;
+use crate::progress_lines;
 use crate::signals::Signals;
 
 /// Receives progress and notes of a verb, and can interrupt it.
@@ -59,7 +60,7 @@ impl Observer {
     }
 
     fn styled(&self, bar: ProgressBar, template: &str) -> ProgressBar {
-        let bar = if self.is_silent { ProgressBar::hidden() } else { bar };
+        bar.set_draw_target(if self.is_silent { ProgressDrawTarget::hidden() } else { progress_lines::target() });
         bar.with_style(ProgressStyle::with_template(template).expect("the template is valid"))
     }
 }

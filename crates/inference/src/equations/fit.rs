@@ -42,6 +42,13 @@ pub struct Fitted<R: Residuals> {
     pub at: Vec<f64>,
 }
 
+impl<R: Residuals> Fitted<R> {
+    /// Returns the logarithm of the prior probability of the causes.
+    pub fn log_prior(&self) -> f64 {
+        self.causes.iter().map(|cause| cause.log_prior).sum()
+    }
+}
+
 impl<R: Residuals> Search<'_, R> {
     /// Fits the values of causes: their columns are computed again at each estimate.
     pub fn fit(

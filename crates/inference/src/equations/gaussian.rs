@@ -11,6 +11,7 @@ use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 use rayon::prelude::*;
 
 use super::block::{Block, Column, SHAPES, Shape, Whitener};
+use super::triangular::{inverse, inverse_of_lower};
 
 /// Smallest variance of a block, relative to the stated noise.
 const LEAST_SCALE: f64 = 0.25;
@@ -133,7 +134,7 @@ pub fn posterior(
     let mut noise: Vec<(usize, f64)> = earlier.map_or_else(|| vec![(0, 1.0); blocks.len()], <[(usize, f64)]>::to_vec);
     let mut solution = solve(&products, &members, &noise, &precision, &prior_mean);
     for _ in 0..ITERATIONS {
-        let covariance = solution.factor.inverse();
+        let covariance = inverse(&solution.factor);
         let better: Vec<(usize, f64)> = blocks
             .par_iter()
             .enumerate()
@@ -171,7 +172,7 @@ pub fn posterior(
         - 0.5 * prior_log_determinant;
     Posterior {
         evidence,
-        covariance: solution.factor.inverse(),
+        covariance: inverse(&solution.factor),
         mean: solution.mean,
         noise,
         factor: solution.factor,
@@ -338,50 +339,53 @@ impl Scores {
     /// Computes the products of candidates.
     pub fn new(blocks: &[Block], groups: &[&Group], posterior: &Posterior, candidates: &[&Column]) -> Self {
         let members = members(blocks.len(), groups);
-        let prepared: Vec<(Whitener, DMatrix<f64>, DVector<f64>, f64)> = blocks
-            .par_iter()
-            .zip(&members)
-            .zip(&posterior.noise)
-            .map(|((block, members), (shape, variance))| {
-                let whitener = Whitener::new(block, SHAPES[*shape]);
-                let mut white = DMatrix::zeros(block.y.len(), members.len());
-                let mut y = DVector::from_vec(whitener.whiten(&block.y));
-                for (index, (unknown, part)) in members.iter().enumerate() {
-                    white.column_mut(index).copy_from_slice(&whitener.whiten(part));
-                    y.axpy(-posterior.prior_mean[*unknown], &white.column(index), 1.0);
-                }
-                (whitener, white, y, 1.0 / variance)
-            })
-            .collect();
-        let lower = posterior.factor.l();
-        let residual = lower.solve_lower_triangular(&posterior.with_residual).expect("regular");
-        let results: Vec<_> = candidates
-            .par_iter()
-            .map(|candidate| {
-                let mut product = 0.0;
-                let mut with_unknowns = DVector::zeros(posterior.mean.len());
-                let mut white_parts = Vec::new();
-                for (block, part) in &candidate.parts {
-                    let (whitener, white, y, weight) = &prepared[*block];
-                    let own = DVector::from_vec(whitener.whiten(part));
-                    product += weight * own.dot(y);
-                    for (value, (unknown, _)) in white.tr_mul(&own).iter().zip(&members[*block]) {
-                        with_unknowns[*unknown] += weight * value;
-                    }
-                    let root = weight.sqrt();
-                    white_parts.push((*block, own.iter().map(|value| root * value).collect::<Vec<f64>>()));
-                }
-                let explained = lower.solve_lower_triangular(&with_unknowns).expect("regular");
-                (product - explained.dot(&residual), white_parts, explained)
-            })
-            .collect();
-        let mut scores = Self { with_residual: Vec::new(), white: Vec::new(), explained: Vec::new() };
-        for (product, white, explained) in results {
-            scores.with_residual.push(product);
-            scores.white.push(white);
-            scores.explained.push(explained);
+        let mut parts: Vec<Vec<(usize, &[f64])>> = vec![Vec::new(); blocks.len()];
+        for (candidate, column) in candidates.iter().enumerate() {
+            for (block, part) in &column.parts {
+                parts[*block].push((candidate, part));
+            }
         }
-        scores
+        // White candidates of each block, with their products with its unknowns and with its residuals.
+        let of_blocks: Vec<(DMatrix<f64>, DMatrix<f64>, DVector<f64>)> = (0..blocks.len())
+            .into_par_iter()
+            .map(|index| {
+                let (shape, variance) = posterior.noise[index];
+                let whitener = Whitener::new(&blocks[index], SHAPES[shape]);
+                let root = 1.0 / variance.sqrt();
+                let white = |parts: &[(usize, &[f64])]| {
+                    let mut white = DMatrix::zeros(blocks[index].y.len(), parts.len());
+                    for (place, (_, part)) in parts.iter().enumerate() {
+                        white.column_mut(place).copy_from_slice(&whitener.whiten(part));
+                    }
+                    white * root
+                };
+                let [of_unknowns, of_candidates] = [white(&members[index]), white(&parts[index])];
+                let known = members[index].iter().map(|(unknown, _)| posterior.prior_mean[*unknown]);
+                let y = root * DVector::from_vec(whitener.whiten(&blocks[index].y))
+                    - &of_unknowns * DVector::from_iterator(members[index].len(), known);
+                let transposed = of_candidates.transpose();
+                (of_unknowns.transpose() * &of_candidates, of_candidates, transposed * y)
+            })
+            .map(|(with_unknowns, white, with_y)| (white, with_unknowns, with_y))
+            .collect();
+        let mut with_unknowns = DMatrix::zeros(posterior.mean.len(), candidates.len());
+        let mut with_residual = DVector::zeros(candidates.len());
+        let mut white: Vec<Vec<(usize, Vec<f64>)>> = vec![Vec::new(); candidates.len()];
+        for (index, (own, of_unknowns, of_y)) in of_blocks.iter().enumerate() {
+            for (place, (candidate, _)) in parts[index].iter().enumerate() {
+                for (row, (unknown, _)) in members[index].iter().enumerate() {
+                    with_unknowns[(*unknown, *candidate)] += of_unknowns[(row, place)];
+                }
+                with_residual[*candidate] += of_y[place];
+                white[*candidate].push((index, own.column(place).iter().copied().collect()));
+            }
+        }
+        let inverse = inverse_of_lower(&posterior.factor.l());
+        let explained = &inverse * with_unknowns;
+        let residual = inverse * &posterior.with_residual;
+        with_residual -= explained.transpose() * residual;
+        let explained = explained.column_iter().map(|column| column.into_owned()).collect();
+        Self { with_residual: with_residual.iter().copied().collect(), white, explained }
     }
 
     /// Returns the products of some candidates with each other that the unknowns do not explain.

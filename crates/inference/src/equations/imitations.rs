@@ -21,6 +21,8 @@ use super::unknown::unknown_law;
 const FORM_ERROR: f64 = 0.01;
 /// Standard deviation of the relative change of a law's size with each of [`MODULATORS`]: of a law of the catalogue, and of another one.
 const FORM_CHANGE: [f64; 2] = [0.03, 0.5];
+/// Difference of what two laws explain, relative to it, below which they are one law.
+const SAME: f64 = 0.1;
 /// Least standard deviation of a function of the state; one that changes less is constant.
 const LEAST_CHANGE: f64 = 0.05;
 
@@ -32,6 +34,8 @@ pub struct Replacement {
     laws: Vec<UnknownLaw>,
     /// By how much it is better than the cause [nat].
     pub gain: f64,
+    /// By how much what it explains differs from what the cause explains, relative to the latter.
+    pub difference: f64,
 }
 
 impl<R: Residuals> Search<'_, R> {
@@ -49,11 +53,16 @@ impl<R: Residuals> Search<'_, R> {
             let functions = self.of_functions(&best, &without, place);
             for (what, found) in [("a size that changes", &changed), ("functions of the state", &functions)] {
                 if let Some(found) = found {
-                    self.note(format!("  {what} in place of {name}: {:.1} nat", found.gain));
+                    let other = 100.0 * found.difference;
+                    self.note(format!(
+                        "  {what} in place of {name}: {:.1} nat, {other:.0} % of it differs",
+                        found.gain
+                    ));
                 }
             }
             let changed = changed.filter(|found| found.gain > LEAST_GAIN);
-            let functions = functions.filter(|found| found.gain > 0.0);
+            // The catalogue has most of the functions, too.
+            let functions = functions.filter(|found| found.gain > 0.0 && found.difference > SAME);
             let Some(law) = functions.or(changed) else {
                 place += 1;
                 continue;
@@ -90,9 +99,12 @@ impl<R: Residuals> Search<'_, R> {
         if found.terms.is_empty() {
             return None;
         }
-        let imitated = Self::evidence_with(without, best, free.clone())
+        let with_functions = Self::posterior_with(without, best, free.clone());
+        let imitated = with_functions.evidence
+            + without.log_prior()
             + (UNKNOWN_PROBABILITY * cause.scope.probability).ln()
             + found.log_choices;
+        let difference = difference(best, place, &free, &with_functions);
         // A law of the catalogue has its form, or a slightly different one.
         let unknowns = law.form.units.len();
         let near = joints.iter().enumerate().flat_map(|(site, joint)| {
@@ -111,7 +123,7 @@ impl<R: Residuals> Search<'_, R> {
             gain: imitated - without.evidence,
             ..unknown_law(&found, index, &self.base.tree.joints[*joint].name, is_of_drive)
         });
-        Some(Replacement { groups: free, laws: described.collect(), gain: imitated - named })
+        Some(Replacement { groups: free, laws: described.collect(), gain: imitated - named, difference })
     }
 
     /// Returns the law of a cause with a size that changes with the state: nothing of the catalogue does that.
@@ -155,6 +167,7 @@ impl<R: Residuals> Search<'_, R> {
             groups: own.chain([changing]).collect(),
             laws: described.collect(),
             gain: gain + UNKNOWN_PROBABILITY.ln(),
+            difference: found.mean[first + largest].abs(),
         })
     }
 
@@ -194,14 +207,23 @@ impl<R: Residuals> Search<'_, R> {
 
     /// Returns the evidence of a fit with further unknowns, with the noise of `best`.
     fn evidence_with(fit: &Fitted<R>, best: &Fitted<R>, further: Vec<Group>) -> f64 {
-        let log_prior: f64 = fit.causes.iter().map(|cause| cause.log_prior).sum();
-        Self::posterior_with(fit, best, further).evidence + log_prior
+        Self::posterior_with(fit, best, further).evidence + fit.log_prior()
     }
 
     pub fn posterior_with(fit: &Fitted<R>, best: &Fitted<R>, further: Vec<Group>) -> Posterior {
         let groups: Vec<Group> = fit.groups.iter().cloned().chain(further).collect();
         posterior(&fit.blocks, [&fit.small.groups, &groups], Some(&best.posterior.noise), &fit.small.cache)
     }
+}
+
+/// Returns by how much what functions explain differs from what a cause explains, relative to the latter.
+fn difference<R: Residuals>(best: &Fitted<R>, place: usize, functions: &[Group], found: &Posterior) -> f64 {
+    let of_cause = sum(&best.groups[place].columns, &best.causes[place].values.concat());
+    let columns: Vec<Column> = functions.iter().flat_map(|group| group.columns.iter().cloned()).collect();
+    let means: Vec<f64> = found.mean.iter().copied().skip(found.mean.len() - columns.len()).collect();
+    let mut difference = sum(&columns, &means);
+    difference.add(&of_cause.scaled(-1.0));
+    root_mean_square(&difference) / root_mean_square(&of_cause).max(1e-12)
 }
 
 /// Returns the functions of joints that explain most together, and their unknowns.
@@ -240,11 +262,12 @@ fn gain_of_change(mean: f64, variance: f64) -> f64 {
 type Modulator = fn(f64, f64, Option<State>) -> f64;
 
 /// Functions with which the size of an effect may change: time, the effect's own size and direction, and the state of the joint; with what
-/// each depends on, as the prefix of a channel of the log.
+/// each depends on, as the prefix of a channel of the log. What acts on the base changes readings of several units, whose sizes cannot be
+/// compared: its effect may change with time.
 const MODULATORS: [(&str, Modulator); 7] = [
     ("t", |_, t, _| t),
-    ("tau_measured", |effect, _, _| effect.abs()),
-    ("tau_measured", |effect, _, _| effect.signum()),
+    ("tau_measured", |effect, _, state| state.map_or(0.0, |_| effect.abs())),
+    ("tau_measured", |effect, _, state| state.map_or(0.0, |_| effect.signum())),
     ("q", |_, _, state| state.map_or(0.0, |state| state.q)),
     ("dq", |_, _, state| state.map_or(0.0, |state| state.dq.abs())),
     ("dq", |_, _, state| state.map_or(0.0, |state| (state.dq / 0.03).tanh())),

@@ -8,7 +8,7 @@
 //!   [`balance`]: the balance of each joint and of the base in [`samples`] of the log, with its [`columns`], on the [`feet`] that stand; each [`touch`] of a foot on the [`ground`]; the gyroscope.
 //! - [`positions`]: residuals of a log without torques on a fixed base, by simulation; [`small_changes`]: what every robot has a little of.
 //! - [`gaussian`]: the evidence of residuals that are linear in unknowns with normal priors; [`block`]: the noise that is left;
-//!   [`normal`]: unknowns that have a least value.
+//!   [`normal`]: unknowns that have a least value; [`triangular`]: inverses.
 //! - [`law`]: an effect with its unknowns. [`nuisance`]: what every robot has a little of.
 //! - [`search`]: the set of causes of highest evidence, by [`screening`] of all effects, a [`fit`] of the best, and its [`refinement`]; [`imitations`]: causes that only imitate
 //!   another law; [`outcome`]: what it found. [`another_law`]: sums of [`unknown`] functions, that explain more than a cause, or what all causes leave.
@@ -51,6 +51,7 @@ mod system;
 mod tests;
 mod torque_residuals;
 mod touch;
+mod triangular;
 mod undetermined;
 mod unknown;
 

@@ -15,6 +15,7 @@ use super::gaussian::Group;
 use super::law::{Law, Place};
 use super::residuals::{Change, Little, Residuals, Small, State};
 use super::robot::Robot;
+use super::site::Site;
 use super::small_changes::{SmallChange, SmallUnknown, small_unknowns};
 use crate::{Candidate, InferenceError, JointLog, Trace, Window, WindowLength, simulate, windows};
 
@@ -232,6 +233,11 @@ impl Residuals for Positions {
     fn columns(&self, before: (&Robot, &Simulated), changes: &[Change]) -> Vec<Column> {
         let robots: Vec<Robot> = changes.iter().map(|change| change.after.clone()).collect();
         self.columns_of(before, &robots)
+    }
+
+    fn fingerprint(&self, _: Place, _: Site, _: &Robot, _: &Simulated) -> Option<u64> {
+        // Every joint moves all the others.
+        None
     }
 
     fn small(&self, laws: &[Law], robot: &Robot, predicted: &Simulated) -> Small {

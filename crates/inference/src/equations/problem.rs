@@ -1,10 +1,14 @@
 //! What a search for causes works on, and what it remembers.
 
-use super::block::SHAPES;
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex};
+
+use super::block::{Column, SHAPES};
 use super::causes::{Cause, ScopeSites, Screened, UnknownLaw};
 use super::law::Law;
 use super::residuals::Residuals;
 use super::robot::Robot;
+use super::site::Site;
 
 /// Prior probability that an effect is a cause.
 const EFFECT_PROBABILITY: f64 = 1.0 / 12.0;
@@ -32,6 +36,24 @@ pub struct Search<'a, R> {
     pub imitations: Vec<(usize, String)>,
     /// The laws that explain more.
     pub other_laws: Vec<UnknownLaw>,
+    /// Columns of the last screening.
+    pub columns: KnownColumns,
+}
+
+/// Columns by what they are of, with the fingerprint of what they were computed from.
+pub type KnownColumns = Mutex<HashMap<ColumnOf, (u64, Arc<Column>)>>;
+
+/// Column of an unknown of a law at a site.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct ColumnOf {
+    /// Index of the law.
+    pub law: usize,
+    /// Index of the strength or of the shape.
+    pub variant: usize,
+    /// The site.
+    pub site: Site,
+    /// Index of the unknown.
+    pub unknown: usize,
 }
 
 /// Candidates in the place of a cause.
@@ -56,6 +78,7 @@ impl<'a, R: Residuals> Search<'a, R> {
             screened: Vec::new(),
             imitations: Vec::new(),
             other_laws: Vec::new(),
+            columns: KnownColumns::default(),
         }
     }
 

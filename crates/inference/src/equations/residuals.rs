@@ -90,6 +90,9 @@ pub trait Residuals: Sync {
     /// Returns what each change changes of a robot, in the residuals.
     fn columns(&self, before: (&Robot, &Self::Predicted), changes: &[Change]) -> Vec<Column>;
 
+    /// Returns a number that is equal for equal columns of laws with a place at a site; `None` if it is not known.
+    fn fingerprint(&self, place: Place, site: Site, robot: &Robot, predicted: &Self::Predicted) -> Option<u64>;
+
     /// Returns the small unknowns around a robot.
     fn small(&self, laws: &[Law], robot: &Robot, predicted: &Self::Predicted) -> Small;
 

@@ -1,5 +1,8 @@
 //! Screening: the gain of every effect on every scope, at the noise of the causes that were found.
 
+use std::collections::HashMap;
+use std::sync::Arc;
+
 use nalgebra::{DMatrix, DVector};
 use twinstep_effects::Target;
 
@@ -7,9 +10,9 @@ use super::block::Column;
 use super::causes::{Cause, ScopeSites, Screened};
 use super::fit::Fitted;
 use super::gaussian::{Group, Scores, gain};
-use super::law::Law;
+use super::law::{Law, Place};
 use super::normal;
-use super::problem::Search;
+use super::problem::{ColumnOf, Search};
 use super::residuals::{Change, Residuals};
 use super::site::{Site, apply, least};
 
@@ -22,14 +25,10 @@ pub const PRESENT: f64 = 0.1;
 /// Candidates that are fitted in full after each screening, and at most of one effect.
 const FITTED: [usize; 2] = [6, 3];
 
-/// Column of one unknown of a law at one site.
+/// What may be added, with its column.
 struct Candidate {
-    law: usize,
-    /// Index of the strength or of the shape.
-    variant: usize,
-    site: Site,
-    unknown: usize,
-    column: Column,
+    of: ColumnOf,
+    column: Arc<Column>,
 }
 
 impl<R: Residuals> Search<'_, R> {
@@ -54,14 +53,14 @@ impl<R: Residuals> Search<'_, R> {
     /// Returns every effect on every scope with its gain, the best first.
     fn screened(&self, best: &Fitted<R>, only: Option<&[Site]>) -> Vec<(f64, Cause)> {
         let candidates = self.candidates(best, only);
-        let columns: Vec<&Column> = candidates.iter().map(|candidate| &candidate.column).collect();
+        let columns: Vec<&Column> = candidates.iter().map(|candidate| &*candidate.column).collect();
         let groups: Vec<&Group> = best.small.groups.iter().chain(&best.groups).collect();
         let scores = Scores::new(&best.blocks, &groups, &best.posterior, &columns);
         let mut hypotheses: Vec<(f64, Cause)> = Vec::new();
         for law in 0..self.laws.len() {
             for shape in 0..self.variants(law) {
                 let own: Vec<usize> = (0..candidates.len())
-                    .filter(|index| candidates[*index].law == law && candidates[*index].variant == shape)
+                    .filter(|index| candidates[*index].of.law == law && candidates[*index].of.variant == shape)
                     .collect();
                 if own.is_empty() {
                     continue;
@@ -102,39 +101,74 @@ impl<R: Residuals> Search<'_, R> {
     }
 
     fn candidates(&self, best: &Fitted<R>, only: Option<&[Site]>) -> Vec<Candidate> {
-        let mut all: Vec<(usize, usize, Site, usize)> = Vec::new();
+        let mut all: Vec<ColumnOf> = Vec::new();
         for (index, law) in self.laws.iter().enumerate() {
             let mut sites: Vec<Site> = self.scopes_of(law).flat_map(|scope| scope.sites.iter().copied()).collect();
             sites.retain(|site| only.is_none_or(|only| only.contains(site)));
             sites.sort();
             sites.dedup();
-            for site in sites {
-                for variant in 0..self.variants(index) {
-                    all.extend((0..law.form.units.len()).map(|unknown| (index, variant, site, unknown)));
-                }
-            }
+            let variants = self.variants(index);
+            let of = |(site, variant, unknown)| ColumnOf { law: index, variant, site, unknown };
+            let unknowns = law.form.units.len();
+            let pairs = sites.into_iter().flat_map(|site| (0..variants).map(move |variant| (site, variant)));
+            all.extend(pairs.flat_map(|(site, variant)| (0..unknowns).map(move |one| (site, variant, one))).map(of));
         }
-        let unknowns_of = |(index, variant, _, unknown): &(usize, usize, Site, usize)| {
-            let law = &self.laws[*index];
-            let mut unknowns = vec![0.0; law.form.units.len()];
-            unknowns[*unknown] = law.strengths.get(*variant).copied().unwrap_or(0.5 * law.form.units[*unknown]);
-            unknowns
+        let columns = self.columns_of(best, &all);
+        let candidates = all.into_iter().zip(columns).map(|(of, column)| Candidate { of, column });
+        candidates.filter(|candidate| !candidate.column.is_zero()).collect()
+    }
+
+    /// Returns columns around a fit, per unit of their unknown or per strength. Those that cannot have changed are not computed again.
+    fn columns_of(&self, best: &Fitted<R>, all: &[ColumnOf]) -> Vec<Arc<Column>> {
+        let mut prints: HashMap<(Place, Site), Option<u64>> = HashMap::new();
+        let mut print = |of: &ColumnOf| {
+            let place = self.laws[of.law].form.place;
+            let print = || self.system.fingerprint(place, of.site, &best.robot, &best.predicted);
+            *prints.entry((place, of.site)).or_insert_with(print)
         };
-        let change = |one: &(usize, usize, Site, usize)| {
-            let law = &self.laws[one.0];
-            let shape = law.shapes.get(one.1).copied().unwrap_or(law.shapes[0]);
-            let mut after = best.robot.clone();
-            apply(&mut after, law, one.2, &unknowns_of(one), shape);
-            Change { law, site: one.2, after }
+        let prints: Vec<Option<u64>> = all.iter().map(&mut print).collect();
+        let mut known = self.columns.lock().expect("no panic");
+        let is_known = |(of, print): &(&ColumnOf, &Option<u64>)| {
+            known.get(of).is_some_and(|(earlier, _)| Some(*earlier) == **print)
         };
-        let changes: Vec<Change> = all.iter().map(change).collect();
-        let columns = self.system.columns((&best.robot, &best.predicted), &changes);
-        let candidate = |(one, column): (&(usize, usize, Site, usize), Column)| {
-            let (law, variant, site, unknown) = *one;
-            let step = if self.laws[law].strengths.is_empty() { unknowns_of(one)[unknown] } else { 1.0 };
-            Candidate { law, variant, site, unknown, column: column.scaled(1.0 / step) }
+        let missing: Vec<ColumnOf> = all.iter().zip(&prints).filter(|one| !is_known(one)).map(|(of, _)| *of).collect();
+        let changes: Vec<Change> = missing.iter().map(|of| self.change(best, of)).collect();
+        let computed = self.system.columns((&best.robot, &best.predicted), &changes);
+        let mut computed: HashMap<ColumnOf, Arc<Column>> = missing
+            .iter()
+            .zip(computed)
+            .map(|(of, column)| (*of, Arc::new(column.scaled(1.0 / self.step(of)))))
+            .collect();
+        let column = |(of, print): (&ColumnOf, &Option<u64>)| match (computed.remove(of), print) {
+            (None, _) => known[of].1.clone(),
+            (Some(column), None) => column,
+            (Some(column), Some(print)) => {
+                known.insert(*of, (*print, column.clone()));
+                column
+            }
         };
-        all.iter().zip(columns).map(candidate).filter(|candidate| !candidate.column.is_zero()).collect()
+        all.iter().zip(&prints).map(column).collect()
+    }
+
+    /// Returns the robot with some of an unknown.
+    fn change(&self, best: &Fitted<R>, of: &ColumnOf) -> Change<'_> {
+        let law = &self.laws[of.law];
+        let shape = law.shapes.get(of.variant).copied().unwrap_or(law.shapes[0]);
+        let mut after = best.robot.clone();
+        apply(&mut after, law, of.site, &self.unknowns(of), shape);
+        Change { law, site: of.site, after }
+    }
+
+    fn unknowns(&self, of: &ColumnOf) -> Vec<f64> {
+        let law = &self.laws[of.law];
+        let mut unknowns = vec![0.0; law.form.units.len()];
+        unknowns[of.unknown] = law.strengths.get(of.variant).copied().unwrap_or(0.5 * law.form.units[of.unknown]);
+        unknowns
+    }
+
+    /// Returns by what a column is divided: strengths are unknowns relative to those that are tried.
+    fn step(&self, of: &ColumnOf) -> f64 {
+        if self.laws[of.law].strengths.is_empty() { self.unknowns(of)[of.unknown] } else { 1.0 }
     }
 
     pub fn scopes_of<'b>(&'b self, law: &'b Law) -> impl Iterator<Item = &'b ScopeSites> {
@@ -172,7 +206,7 @@ impl<R: Residuals> Search<'_, R> {
                 continue;
             }
             let members: Vec<usize> =
-                (0..own.len()).filter(|index| scope.sites.contains(&candidates[own[*index]].site)).collect();
+                (0..own.len()).filter(|index| scope.sites.contains(&candidates[own[*index]].of.site)).collect();
             if members.is_empty() {
                 continue;
             }
@@ -185,11 +219,11 @@ impl<R: Residuals> Search<'_, R> {
             let mean = DVector::from_element(size, if is_strength { 1.0 } else { 0.0 });
             let covariance = DMatrix::from_fn(size, size, |row, column| {
                 let (one, other) = (&candidates[own[members[row]]], &candidates[own[members[column]]]);
-                if one.unknown != other.unknown {
+                if one.of.unknown != other.of.unknown {
                     return 0.0;
                 }
-                let unit = if is_strength { CELL } else { law.form.units[one.unknown] };
-                unit * unit * scope.covariance(one.site == other.site)
+                let unit = if is_strength { CELL } else { law.form.units[one.of.unknown] };
+                unit * unit * scope.covariance(one.of.site == other.of.site)
             });
             let (gain, posterior, spread) = gain(&with_residual, &inner, &mean, &covariance);
             let variants = self.variants(law_index) as f64;
@@ -199,8 +233,8 @@ impl<R: Residuals> Search<'_, R> {
             if law.form.is_positive {
                 // Posterior and prior are relative to a strength that is tried.
                 let prior = if is_strength { 1.0 } else { law.form.units[0] };
-                let bound = |row: usize| least(candidates[own[members[row]]].site);
-                let first = (0..size).filter(|row| candidates[own[members[*row]]].unknown == 0);
+                let bound = |row: usize| least(candidates[own[members[row]]].of.site);
+                let first = (0..size).filter(|row| candidates[own[members[*row]]].of.unknown == 0);
                 log_grid += if scope.is_alike {
                     let count = first.clone().count() as f64;
                     let mean = first.clone().map(|row| posterior[row]).sum::<f64>() / count;
@@ -216,11 +250,11 @@ impl<R: Residuals> Search<'_, R> {
             let mut values = vec![vec![0.0; law.form.units.len()]; scope.sites.len()];
             for (row, member) in members.iter().enumerate() {
                 let candidate = &candidates[own[*member]];
-                let site = scope.sites.iter().position(|site| *site == candidate.site).expect("a site of the scope");
-                let strength = law.strengths.get(candidate.variant).copied().unwrap_or(1.0);
+                let site = scope.sites.iter().position(|site| *site == candidate.of.site).expect("a site of the scope");
+                let strength = law.strengths.get(candidate.of.variant).copied().unwrap_or(1.0);
                 let value = strength * posterior[row];
-                values[site][candidate.unknown] =
-                    if candidate.unknown == 0 { law.possible(value, least(candidate.site)) } else { value };
+                values[site][candidate.of.unknown] =
+                    if candidate.of.unknown == 0 { law.possible(value, least(candidate.of.site)) } else { value };
             }
             let shape = law.shapes.get(variant).copied().unwrap_or(law.shapes[0]);
             let log_shapes = -(law.shapes.len() as f64).ln();

@@ -2,6 +2,8 @@
 
 use std::sync::Arc;
 
+use rayon::prelude::*;
+
 use super::causes::{Cause, Found};
 use super::fit::Fitted;
 use super::problem::{Rivals, Search, power};
@@ -70,12 +72,16 @@ impl<R: Residuals> Search<'_, R> {
         }
         let candidates = self.screen(&best);
         let mut fits: Vec<(f64, Fitted<R>)> = Vec::new();
-        for (screened, cause) in candidates {
-            if !go_on(&format!("{}, trying {}", self.progress(&best), self.name(&cause))) {
+        for some in candidates.chunks(rayon::current_num_threads()) {
+            let names = some.iter().map(|(_, cause)| self.name(cause)).collect::<Vec<_>>().join(", ");
+            if !go_on(&format!("{}, trying {names}", self.progress(&best))) {
                 return None;
             }
-            let causes = [best.causes.as_slice(), &[cause]].concat();
-            fits.push((screened, self.fit(causes, &best.small, self.system.trial_steps(), Some(&best))));
+            let fit = |(screened, cause): &(f64, Cause)| {
+                let causes = [best.causes.as_slice(), std::slice::from_ref(cause)].concat();
+                (*screened, self.fit(causes, &best.small, self.system.trial_steps(), Some(&best)))
+            };
+            fits.extend(some.par_iter().map(fit).collect::<Vec<_>>());
         }
         for (screened, fit) in &fits {
             let cause = &fit.causes[fit.causes.len() - 1];
@@ -199,7 +205,7 @@ impl<R: Residuals> Search<'_, R> {
     /// Removes causes that no longer have evidence beside the others.
     pub fn without_surplus(&mut self, mut best: Fitted<R>) -> Fitted<R> {
         while !best.causes.is_empty() {
-            let fits = (0..best.causes.len()).map(|removed| {
+            let fits = (0..best.causes.len()).into_par_iter().map(|removed| {
                 let mut causes = best.causes.clone();
                 causes.remove(removed);
                 (removed, self.fit(causes, &best.small, 2, Some(&best)))

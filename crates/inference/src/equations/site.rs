@@ -13,7 +13,7 @@ const LONGEST_ARM: f64 = 0.5;
 const LEAST_MOMENT: f64 = 0.1;
 
 /// Where a law acts.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Site {
     /// A joint, or its link.
     Joint(usize),

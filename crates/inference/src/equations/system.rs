@@ -1,5 +1,6 @@
 //! All equations of a log: blocks of residuals, and the column of any change of the robot.
 
+use std::hash::{DefaultHasher, Hash, Hasher};
 use std::sync::OnceLock;
 
 use rayon::prelude::*;
@@ -221,6 +222,26 @@ impl System {
             (Place::Slip | Place::Sink, _) => self.balance.ground_column(robot, after, &predicted.lacking),
             (_, Site::Base) => Column::default(),
         }
+    }
+
+    /// Returns a number that changes with all from which the columns of a place at a site are computed; `None` where they are few.
+    pub fn fingerprint(&self, place: Place, site: Site, robot: &Robot, predicted: &Predicted) -> Option<u64> {
+        let mut hash = DefaultHasher::new();
+        match (place, site) {
+            (Place::Body, _) => {
+                let offsets: Vec<f64> = robot.joints.iter().map(|joint| joint.actuator.encoder_offset).collect();
+                format!("{:?}", (&robot.tree, robot.gyro_bias, offsets)).hash(&mut hash);
+            }
+            (Place::Slip | Place::Sink | Place::Gyro, _) | (_, Site::Base) => return None,
+            (_, Site::Joint(joint)) => {
+                let models = (&robot.joints[joint], robot.thermal[joint], robot.voltage_exponent);
+                format!("{models:?}").hash(&mut hash);
+                let torques = predicted.sensed[joint].iter().chain(&predicted.motor[joint]);
+                let torques = torques.chain(predicted.balanced.iter().map(|motors| &motors[joint]));
+                torques.for_each(|torque| torque.to_bits().hash(&mut hash));
+            }
+        }
+        Some(hash.finish())
     }
 
     /// Returns the column of an offset of a joint's torque sensor, per N·m.

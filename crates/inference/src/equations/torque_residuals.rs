@@ -6,6 +6,7 @@ use super::block::{Block, Column};
 use super::law::{Law, Place};
 use super::residuals::{Change, Little, Residuals, Small, State};
 use super::robot::Robot;
+use super::site::Site;
 use super::system::{Predicted, System};
 use super::{nuisance, unknown};
 
@@ -42,6 +43,10 @@ impl Residuals for System {
 
     fn columns(&self, before: (&Robot, &Predicted), changes: &[Change]) -> Vec<Column> {
         changes.par_iter().map(|change| self.column(change.law, change.site, before, &change.after)).collect()
+    }
+
+    fn fingerprint(&self, place: Place, site: Site, robot: &Robot, predicted: &Predicted) -> Option<u64> {
+        self.fingerprint(place, site, robot, predicted)
     }
 
     fn small(&self, laws: &[Law], robot: &Robot, predicted: &Predicted) -> Small {

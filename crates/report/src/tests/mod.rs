@@ -70,6 +70,10 @@ fn page_has_headline_twelve_joints_time_series_laws_and_provenance() {
     let page = page(&diagnosis, &evidence(&recording(), &extended));
     check(&page);
     assert!(page.contains("<h1><strong>Coulomb friction of the calves</strong> (1.00 N·m, 95 %: 0.94 to 1.06), "));
+    assert!(
+        page.contains("by <strong>−61 %</strong>. The prediction")
+            && page.contains("−58 % (90 % interval −63 % to −50 %)")
+    );
     assert!(page.contains("together they remove 61 % of the joint position error (0.0360 → 0.0140 rad)"));
     assert_eq!(page.matches("class=\"cell\"").count(), 24, "twelve of each model");
     assert_eq!(page.matches("class=\"line measured\"").count(), 1);

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use twinstep_diagnose::{
     AlternativeCause, Cause, CorrelatedPair, Diagnosis, DiscriminatedPair, Estimate, NextExperiment, ParameterValue,
-    RmsErrors, Unexplained,
+    Promise, Reduction, RmsErrors, Unexplained,
 };
 use twinstep_effects::{Effect, ModelFile};
 use twinstep_logs::{Gain, Log, Meta, Segment, TorqueSensor};
@@ -97,7 +97,11 @@ pub fn findings() -> (Diagnosis, ModelFile) {
         }),
         decisions: Vec::new(),
         not_reported: Vec::new(),
-        promise: None,
+        promise: Some(Promise {
+            all: Reduction { predicted: 0.58, interval: [0.5, 0.63], found: 0.61 },
+            by_joint: BTreeMap::new(),
+            by_motion: BTreeMap::new(),
+        }),
         extended_model: "extended.toml".to_owned(),
     };
     (diagnosis, extended)
