@@ -58,8 +58,10 @@ def test_rsl_rl_trains_a_policy(tmp_path: Path) -> None:
 def test_exploration_policies_are_trained_by_either_library(tmp_path: Path) -> None:
     pytest.importorskip("stable_baselines3")
     pytest.importorskip("rsl_rl")
-    # The networks of the ensemble's own tests, as the actuators of a Go2.
-    ensemble = ROOT / "ensemble/golden/actuators.safetensors"
+    # The networks of the ensemble's own tests, as the actuators of a Go2 with the gains of the policy.
+    ensemble = tmp_path / "actuators.safetensors"
+    golden = (ROOT / "ensemble/golden/actuators.safetensors").read_bytes()
+    ensemble.write_bytes(golden.replace(b"[25.0,0.6]", b"[30, 0.75]"))
     model = tmp_path / "robot.toml"
     model.write_text(f'robot = "go2"\n[actuator]\nmode = "replace"\nensemble = "{ensemble}"\n')
     base = ROOT / "data/policies/walk.safetensors"
@@ -72,5 +74,5 @@ def test_exploration_policies_are_trained_by_either_library(tmp_path: Path) -> N
 
 
 def test_task_without_uncertainty_is_no_exploration() -> None:
-    with pytest.raises(twinstep.SpecMismatchError, match="epistemic_uncertainty"):
+    with pytest.raises(twinstep.SpecMismatchError, match="the task is `walk`"):
         evaluate_exploration(lambda obs: np.zeros((len(obs), 12), np.float32), 2, task="walk")

@@ -79,13 +79,13 @@ def evaluate_exploration(
     Raises
     ------
     SpecMismatchError
-        The reward of the server has no uncertainty: its task is not ``explore``.
+        The task is not ``explore``.
     """
     arguments = cast(Any, {"task": "explore", **options})
     envs = Go2VectorEnv(num_envs, autoreset_mode="NextStep", max_episode_steps=steps, **arguments)
     try:
-        if TERM not in envs.twinstep_spec.reward_terms:
-            raise SpecMismatchError(f"the reward has no `{TERM}`; its terms are {envs.twinstep_spec.reward_terms}")
+        if envs.twinstep_spec.task != "explore":
+            raise SpecMismatchError(f"the task is `{envs.twinstep_spec.task}`; only `explore` rewards uncertainty")
         obs, _ = envs.reset(seed=seed)
         is_running = np.ones(num_envs, np.bool_)
         moved, falls, total = 0, 0, 0.0
