@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use twinstep_effects::Effect;
-use twinstep_inference::equations::{Explained, Explanation, Passed, UnknownLaw};
+use twinstep_inference::equations::{Explained, Explanation, LawTerm as Term, Passed, UnknownLaw};
 
 use super::findings::{
     AlternativeCause, Cause, CorrelatedPair, Estimate, LawTerm, NotReported, ParameterValue, Unexplained,
@@ -24,7 +24,7 @@ const LEAST_LEFT: f64 = 0.02;
 
 /// Returns the strongest law that the catalogue does not have.
 pub fn unexplained_law(found: &Explained) -> Unexplained {
-    let Some(UnknownLaw { joint, of_drive, variable, terms, gain }) = found.unknown.first() else {
+    let Some(UnknownLaw { joint, quantity, variable, terms, gain }) = found.unknown.first() else {
         if !found.is_of_positions || found.left < LEAST_LEFT {
             return only_noise();
         }
@@ -36,23 +36,45 @@ pub fn unexplained_law(found: &Explained) -> Unexplained {
         return Unexplained { fraction: found.left, text, ..Unexplained::default() };
     };
     let channel = if *variable == "t" { "t".to_owned() } else { format!("{variable}_{joint}") };
-    let place = if *of_drive { "The torque of the drive" } else { "The torque on the link" };
     let others = found.unknown.len() - 1;
     let more = if others == 0 { String::new() } else { format!(" So do {others} more equations.") };
     let law: Vec<LawTerm> = terms.iter().map(law_term).collect();
-    let sum = law.iter().map(|term| format!("{:.2} N·m of {}", term.torque_nm, term.formula));
-    let sum = sum.collect::<Vec<_>>().join(", ");
-    let form =
-        if sum.is_empty() { format!("its size changes with {channel}") } else { format!("it is the sum of {sum}") };
+    let sum = sum(&law);
+    let form = if sum.is_empty() { format!("its size changes with {channel}") } else { format!("it is {sum}") };
     let text = format!(
-        "{place} of {joint} has another law, which the catalogue does not have: {form}. It explains {gain:.0} nat.{more}"
+        "The {quantity} of {joint} has another law, which the catalogue does not have: {form}. It explains {gain:.0} nat.{more}"
     );
     Unexplained { fraction: found.left, depends_on: vec![channel], law, text }
 }
 
-fn law_term((formula, torque, std): &(&str, f64, f64)) -> LawTerm {
-    let half = TWO_SIDED_95 * std;
-    LawTerm { formula: (*formula).to_owned(), torque_nm: *torque, interval: [torque - half, torque + half] }
+fn law_term(term: &Term) -> LawTerm {
+    let half = TWO_SIDED_95 * term.std;
+    LawTerm {
+        formula: term.formula.clone(),
+        coefficient: term.coefficient,
+        torque_nm: term.torque,
+        interval: [term.torque - half, term.torque + half],
+    }
+}
+
+/// Returns a law as a formula.
+fn sum(law: &[LawTerm]) -> String {
+    let term = |(index, term): (usize, &LawTerm)| {
+        let sign = match (index, term.coefficient < 0.0) {
+            (0, false) => "",
+            (0, true) => "-",
+            (_, false) => " + ",
+            (_, true) => " - ",
+        };
+        format!("{sign}{} {}", significant(term.coefficient.abs()), term.formula)
+    };
+    law.iter().enumerate().map(term).collect()
+}
+
+/// Returns a number with three significant digits.
+fn significant(number: f64) -> String {
+    let digits = 2 - number.abs().max(1e-12).log10().floor() as i32;
+    format!("{number:.*}", digits.max(0) as usize)
 }
 
 /// Returns the result for a residual that does not exceed noise.
@@ -183,4 +205,20 @@ fn evidence(cause: &Explanation, joints: &[String]) -> String {
         evidence = format!("{evidence} Each joint has its own: {}.", all.join(", "));
     }
     evidence + " " + cause.effect.signature
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn law_is_a_formula_with_three_significant_digits() {
+        let term = |coefficient, formula: &str| LawTerm {
+            formula: formula.to_owned(),
+            coefficient,
+            torque_nm: 1.0,
+            interval: [0.9, 1.1],
+        };
+        assert_eq!(sum(&[term(-0.19234, "tau"), term(-1234.5, "dq"), term(4.0, "1")]), "-0.192 tau - 1234 dq + 4.00 1");
+    }
 }

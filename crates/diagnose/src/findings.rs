@@ -65,10 +65,11 @@ pub struct NotReported {
 /// Function of what a joint measures: a part of a law that the catalogue does not have.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct LawTerm {
-    /// Formula in measurements relative to their standard deviations: position q, velocity dq, position error e, torque tau, temperature
-    /// T, time t.
+    /// Formula of position q [rad], velocity dq [rad/s], position error e [rad], torque tau [N·m], temperature T [°C] and time t [s].
     pub formula: String,
-    /// Torque, root mean square over the log, with the sign of the formula [N·m].
+    /// Factor of the formula, for a torque [N·m], or an angle between encoder and link [rad].
+    pub coefficient: f64,
+    /// Torque, root mean square over the log, with the sign of the factor [N·m].
     pub torque_nm: f64,
     /// 95 % interval [N·m].
     pub interval: [f64; 2],

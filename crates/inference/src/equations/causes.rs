@@ -90,17 +90,30 @@ pub struct FoundCause {
     pub is_large: bool,
 }
 
+/// A function of a law.
+#[derive(Clone, Debug)]
+pub struct LawTerm {
+    /// Formula of position q [rad], velocity dq [rad/s], position error e [rad], torque tau [N·m], temperature T [°C] and time t [s].
+    pub formula: String,
+    /// Factor of the formula: a torque [N·m], or an angle between encoder and link [rad].
+    pub coefficient: f64,
+    /// Torque, root mean square over the rows, with the sign of the factor [N·m].
+    pub torque: f64,
+    /// Standard deviation of the torque [N·m].
+    pub std: f64,
+}
+
 /// A law that the catalogue does not have.
 #[derive(Clone, Debug)]
 pub struct UnknownLaw {
     /// Name of the joint.
     pub joint: String,
-    /// True if the torque at the sensor shows it, false if only the torque on the link does.
-    pub of_drive: bool,
+    /// What it is a law of: `torque of the drive`, `torque on the link` or `angle between encoder and link`.
+    pub quantity: &'static str,
     /// What it depends on most, as the prefix of a channel of the log.
     pub variable: &'static str,
-    /// Formula, torque (root mean square over the rows) and its standard deviation of each of its functions, the largest first [N·m].
-    pub terms: Vec<(&'static str, f64, f64)>,
+    /// Its functions, the largest first.
+    pub terms: Vec<LawTerm>,
     /// Gain of the evidence [nat].
     pub gain: f64,
 }

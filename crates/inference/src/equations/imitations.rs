@@ -15,7 +15,7 @@ use super::problem::{Search, UNKNOWN_PROBABILITY};
 use super::residuals::{Residuals, Small, State};
 use super::search::LEAST_GAIN;
 use super::site::Site;
-use super::unknown::unknown_law;
+use super::unknown::{quantity, unknown_law};
 
 /// Error of the form of a law of the catalogue, as the size of each function that it lacks, relative to its own.
 const FORM_ERROR: f64 = 0.01;
@@ -118,10 +118,15 @@ impl<R: Residuals> Search<'_, R> {
         });
         let named = [Vec::new(), near.collect()].map(|near| Self::evidence_with(best, best, near));
         let named = named[0].max(named[1]);
-        let is_of_drive = matches!(of, Place::Drive | Place::Sensor | Place::Supply);
         let described = joints.iter().enumerate().map(|(index, joint)| UnknownLaw {
             gain: imitated - without.evidence,
-            ..unknown_law(&found, index, &self.base.tree.joints[*joint].name, is_of_drive)
+            ..unknown_law(
+                &found,
+                index,
+                &self.base.tree.joints[*joint].name,
+                of,
+                &self.system.formulas(&without.predicted, *joint, of),
+            )
         });
         Some(Replacement { groups: free, laws: described.collect(), gain: imitated - named, difference })
     }
@@ -158,7 +163,7 @@ impl<R: Residuals> Search<'_, R> {
         let name = |site: &Site| joint_of(site).map_or("base", |joint| &self.base.tree.joints[joint].name).to_owned();
         let described = cause.scope.sites.iter().map(|site| UnknownLaw {
             joint: name(site),
-            of_drive: matches!(law.form.place, Place::Drive | Place::Sensor | Place::Supply),
+            quantity: quantity(law.form.place),
             variable: variables[largest],
             terms: Vec::new(),
             gain,

@@ -55,6 +55,6 @@ mod triangular;
 mod undetermined;
 mod unknown;
 
-pub use causes::UnknownLaw;
+pub use causes::{LawTerm, UnknownLaw};
 pub use explain::{explain, explain_tree, torque_error};
 pub use explanation::{Explained, Explanation, OfJoint, Passed};

@@ -186,7 +186,8 @@ impl<R: Residuals> Search<'_, R> {
             let gain = law.gain + UNKNOWN_PROBABILITY.ln();
             if gain > LEAST_UNKNOWN {
                 let name = &self.base.tree.joints[*joint].name;
-                found.push(UnknownLaw { gain, ..unknown_law(&law, 0, name, *place == Place::Drive) });
+                let formulas = self.system.formulas(&best.predicted, *joint, *place);
+                found.push(UnknownLaw { gain, ..unknown_law(&law, 0, name, *place, &formulas) });
             }
         }
         found.extend(self.other_laws.iter().cloned());

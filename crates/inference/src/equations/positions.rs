@@ -17,6 +17,7 @@ use super::residuals::{Change, Little, Residuals, Small, State};
 use super::robot::Robot;
 use super::site::Site;
 use super::small_changes::{SmallChange, SmallUnknown, small_unknowns};
+use super::unknown::Formula;
 use crate::{Candidate, InferenceError, JointLog, Trace, Window, WindowLength, simulate, windows};
 
 /// Least time between compared rows [s].
@@ -286,6 +287,10 @@ impl Residuals for Positions {
     }
 
     fn functions(&self, _: &Simulated, _: usize, _: Place) -> Vec<Column> {
+        Vec::new()
+    }
+
+    fn formulas(&self, _: &Simulated, _: usize, _: Place) -> Vec<Formula> {
         Vec::new()
     }
 

@@ -5,6 +5,7 @@ use super::gaussian::{Cache, Group};
 use super::law::{Law, Place};
 use super::robot::Robot;
 use super::site::Site;
+use super::unknown::Formula;
 
 /// State of a joint.
 #[derive(Clone, Copy, Debug)]
@@ -110,6 +111,9 @@ pub trait Residuals: Sync {
 
     /// Returns the columns of [`super::unknown::FUNCTIONS`] at a joint, in the equations of a law's place; none if there are none.
     fn functions(&self, predicted: &Self::Predicted, joint: usize, place: Place) -> Vec<Column>;
+
+    /// Returns these functions in physical units.
+    fn formulas(&self, predicted: &Self::Predicted, joint: usize, place: Place) -> Vec<Formula>;
 
     /// Returns the state of a joint at a time of the log [s].
     fn state(&self, predicted: &Self::Predicted, joint: usize, t: f64) -> State;

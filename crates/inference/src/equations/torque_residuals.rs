@@ -4,11 +4,12 @@ use rayon::prelude::*;
 
 use super::block::{Block, Column};
 use super::law::{Law, Place};
+use super::nuisance;
 use super::residuals::{Change, Little, Residuals, Small, State};
 use super::robot::Robot;
 use super::site::Site;
 use super::system::{Predicted, System};
-use super::{nuisance, unknown};
+use super::unknown::{self, Formula};
 
 impl Residuals for System {
     type Predicted = Predicted;
@@ -70,6 +71,10 @@ impl Residuals for System {
 
     fn functions(&self, predicted: &Predicted, joint: usize, place: Place) -> Vec<Column> {
         unknown::columns(self, predicted, joint, place)
+    }
+
+    fn formulas(&self, predicted: &Predicted, joint: usize, place: Place) -> Vec<Formula> {
+        unknown::formulas(self, predicted, joint, place)
     }
 
     fn state(&self, predicted: &Predicted, joint: usize, t: f64) -> State {
