@@ -384,7 +384,7 @@ impl Scores {
         let explained = &inverse * with_unknowns;
         let residual = inverse * &posterior.with_residual;
         with_residual -= explained.transpose() * residual;
-        let explained = explained.column_iter().map(|column| column.into_owned()).collect();
+        let explained = explained.column_iter().map(nalgebra::Matrix::into_owned).collect();
         Self { with_residual: with_residual.iter().copied().collect(), white, explained }
     }
 

@@ -7,7 +7,7 @@ use nalgebra::DVector;
 
 use super::another_law::{AnotherLaw, Term};
 use super::block::Column;
-use super::causes::UnknownLaw;
+use super::causes::{Cause, UnknownLaw};
 use super::fit::Fitted;
 use super::gaussian::{Group, Posterior, Scores, posterior};
 use super::law::Place;
@@ -104,7 +104,7 @@ impl<R: Residuals> Search<'_, R> {
             + without.log_prior()
             + (UNKNOWN_PROBABILITY * cause.scope.probability).ln()
             + found.log_choices;
-        let difference = difference(best, place, &free, &with_functions);
+        let difference = difference(best, without, place, (&free, &with_functions));
         // A law of the catalogue has its form, or a slightly different one.
         let unknowns = law.form.units.len();
         let near = joints.iter().enumerate().flat_map(|(site, joint)| {
@@ -222,13 +222,45 @@ impl<R: Residuals> Search<'_, R> {
 }
 
 /// Returns by how much what functions explain differs from what a cause explains, relative to the latter.
-fn difference<R: Residuals>(best: &Fitted<R>, place: usize, functions: &[Group], found: &Posterior) -> f64 {
-    let of_cause = sum(&best.groups[place].columns, &best.causes[place].values.concat());
+///
+/// The other causes that act there are part of both: functions that take over from them are no other law.
+fn difference<R: Residuals>(
+    best: &Fitted<R>,
+    without: &Fitted<R>,
+    place: usize,
+    (functions, found): (&[Group], &Posterior),
+) -> f64 {
+    let sites = &best.causes[place].scope.sites;
+    let at_sites = |cause: &Cause, columns: &[Column], values: &[f64]| {
+        let unknowns = cause.values[0].len();
+        let is_there = |(index, _): &(usize, &Column)| sites.contains(&cause.scope.sites[index / unknowns]);
+        let (columns, values): (Vec<Column>, Vec<f64>) = columns
+            .iter()
+            .enumerate()
+            .filter(is_there)
+            .map(|(index, column)| (column.clone(), values[index]))
+            .unzip();
+        sum(&columns, &values)
+    };
+    let (mut before, mut after) = (Column::default(), Column::default());
+    for (cause, group) in best.causes.iter().zip(&best.groups) {
+        before.add(&at_sites(cause, &group.columns, &cause.values.concat()));
+    }
+    let mut first = without.small.len();
+    for (cause, group) in without.causes.iter().zip(&without.groups) {
+        // A fit ends with a step from where its posterior is.
+        let step = |(index, value): (usize, f64)| {
+            value + found.mean[first + index] - without.posterior.mean[first + index]
+        };
+        let values: Vec<f64> = cause.values.concat().into_iter().enumerate().map(step).collect();
+        after.add(&at_sites(cause, &group.columns, &values));
+        first += values.len();
+    }
     let columns: Vec<Column> = functions.iter().flat_map(|group| group.columns.iter().cloned()).collect();
-    let means: Vec<f64> = found.mean.iter().copied().skip(found.mean.len() - columns.len()).collect();
-    let mut difference = sum(&columns, &means);
-    difference.add(&of_cause.scaled(-1.0));
-    root_mean_square(&difference) / root_mean_square(&of_cause).max(1e-12)
+    let means: Vec<f64> = found.mean.iter().copied().skip(first).collect();
+    after.add(&sum(&columns, &means));
+    after.add(&before.scaled(-1.0));
+    root_mean_square(&after) / root_mean_square(&before).max(1e-12)
 }
 
 /// Returns the functions of joints that explain most together, and their unknowns.

@@ -224,26 +224,6 @@ impl System {
         }
     }
 
-    /// Returns a number that changes with all from which the columns of a place at a site are computed; `None` where they are few.
-    pub fn fingerprint(&self, place: Place, site: Site, robot: &Robot, predicted: &Predicted) -> Option<u64> {
-        let mut hash = DefaultHasher::new();
-        match (place, site) {
-            (Place::Body, _) => {
-                let offsets: Vec<f64> = robot.joints.iter().map(|joint| joint.actuator.encoder_offset).collect();
-                format!("{:?}", (&robot.tree, robot.gyro_bias, offsets)).hash(&mut hash);
-            }
-            (Place::Slip | Place::Sink | Place::Gyro, _) | (_, Site::Base) => return None,
-            (_, Site::Joint(joint)) => {
-                let models = (&robot.joints[joint], robot.thermal[joint], robot.voltage_exponent);
-                format!("{models:?}").hash(&mut hash);
-                let torques = predicted.sensed[joint].iter().chain(&predicted.motor[joint]);
-                let torques = torques.chain(predicted.balanced.iter().map(|motors| &motors[joint]));
-                torques.for_each(|torque| torque.to_bits().hash(&mut hash));
-            }
-        }
-        Some(hash.finish())
-    }
-
     /// Returns the column of an offset of a joint's torque sensor, per N·m.
     pub fn torque_offset(&self, joint: usize) -> Column {
         if !self.measured.has_torque {
@@ -316,6 +296,26 @@ impl System {
         parts.retain(|(_, rows)| rows.iter().any(|row| *row != 0.0));
         Column { parts }
     }
+}
+
+/// Returns a number that changes with all from which the columns of a place at a site are computed; `None` where they are few.
+pub fn fingerprint(place: Place, site: Site, robot: &Robot, predicted: &Predicted) -> Option<u64> {
+    let mut hash = DefaultHasher::new();
+    match (place, site) {
+        (Place::Body, _) => {
+            let offsets: Vec<f64> = robot.joints.iter().map(|joint| joint.actuator.encoder_offset).collect();
+            format!("{:?}", (&robot.tree, robot.gyro_bias, offsets)).hash(&mut hash);
+        }
+        (Place::Slip | Place::Sink | Place::Gyro, _) | (_, Site::Base) => return None,
+        (_, Site::Joint(joint)) => {
+            let models = (&robot.joints[joint], robot.thermal[joint], robot.voltage_exponent);
+            format!("{models:?}").hash(&mut hash);
+            let torques = predicted.sensed[joint].iter().chain(&predicted.motor[joint]);
+            let torques = torques.chain(predicted.balanced.iter().map(|motors| &motors[joint]));
+            torques.for_each(|torque| torque.to_bits().hash(&mut hash));
+        }
+    }
+    Some(hash.finish())
 }
 
 /// Returns the mean square of the differences of neighbouring torques, which are noise rather than what a model lacks.

@@ -8,7 +8,7 @@ use super::nuisance;
 use super::residuals::{Change, Little, Residuals, Small, State};
 use super::robot::Robot;
 use super::site::Site;
-use super::system::{Predicted, System};
+use super::system::{self, Predicted, System};
 use super::unknown::{self, Formula};
 
 impl Residuals for System {
@@ -47,7 +47,7 @@ impl Residuals for System {
     }
 
     fn fingerprint(&self, place: Place, site: Site, robot: &Robot, predicted: &Predicted) -> Option<u64> {
-        self.fingerprint(place, site, robot, predicted)
+        system::fingerprint(place, site, robot, predicted)
     }
 
     fn small(&self, laws: &[Law], robot: &Robot, predicted: &Predicted) -> Small {
