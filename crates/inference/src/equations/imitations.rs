@@ -234,12 +234,8 @@ fn difference<R: Residuals>(
     let at_sites = |cause: &Cause, columns: &[Column], values: &[f64]| {
         let unknowns = cause.values[0].len();
         let is_there = |(index, _): &(usize, &Column)| sites.contains(&cause.scope.sites[index / unknowns]);
-        let (columns, values): (Vec<Column>, Vec<f64>) = columns
-            .iter()
-            .enumerate()
-            .filter(is_there)
-            .map(|(index, column)| (column.clone(), values[index]))
-            .unzip();
+        let (columns, values): (Vec<Column>, Vec<f64>) =
+            columns.iter().enumerate().filter(is_there).map(|(index, column)| (column.clone(), values[index])).unzip();
         sum(&columns, &values)
     };
     let (mut before, mut after) = (Column::default(), Column::default());
@@ -249,9 +245,8 @@ fn difference<R: Residuals>(
     let mut first = without.small.len();
     for (cause, group) in without.causes.iter().zip(&without.groups) {
         // A fit ends with a step from where its posterior is.
-        let step = |(index, value): (usize, f64)| {
-            value + found.mean[first + index] - without.posterior.mean[first + index]
-        };
+        let step =
+            |(index, value): (usize, f64)| value + found.mean[first + index] - without.posterior.mean[first + index];
         let values: Vec<f64> = cause.values.concat().into_iter().enumerate().map(step).collect();
         after.add(&at_sites(cause, &group.columns, &values));
         first += values.len();

@@ -13,11 +13,10 @@ use twinstep_model::{CONTACT, JointModel, RobotTree, TreeModel};
 use super::block::{Block, Column};
 use super::gaussian::Group;
 use super::law::{Law, Place};
-use super::residuals::{Change, Little, Residuals, Small, State};
+use super::residuals::{Change, Formula, Little, Residuals, Small, State};
 use super::robot::Robot;
 use super::site::Site;
 use super::small_changes::{SmallChange, SmallUnknown, small_unknowns};
-use super::unknown::Formula;
 use crate::{Candidate, InferenceError, JointLog, Trace, Window, WindowLength, simulate, windows};
 
 /// Least time between compared rows [s].

@@ -5,7 +5,6 @@ use super::gaussian::{Cache, Group};
 use super::law::{Law, Place};
 use super::robot::Robot;
 use super::site::Site;
-use super::unknown::Formula;
 
 /// State of a joint.
 #[derive(Clone, Copy, Debug)]
@@ -59,6 +58,15 @@ pub struct Little {
     pub unknowns: Vec<f64>,
     /// Their standard deviations.
     pub stds: Vec<f64>,
+}
+
+/// A function at a joint in physical units.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Formula {
+    /// Formula of position q [rad], velocity dq [rad/s], position error e [rad], torque tau [N·m], temperature T [°C] and time t [s].
+    pub text: String,
+    /// Factor of the formula for a torque of 1 N·m, root mean square; of an angle between encoder and link [rad] where the law is of one.
+    pub per_torque: f64,
 }
 
 /// Residuals of a log.

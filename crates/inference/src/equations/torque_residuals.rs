@@ -5,11 +5,11 @@ use rayon::prelude::*;
 use super::block::{Block, Column};
 use super::law::{Law, Place};
 use super::nuisance;
-use super::residuals::{Change, Little, Residuals, Small, State};
+use super::residuals::{Change, Formula, Little, Residuals, Small, State};
 use super::robot::Robot;
 use super::site::Site;
 use super::system::{self, Predicted, System};
-use super::unknown::{self, Formula};
+use super::unknown;
 
 impl Residuals for System {
     type Predicted = Predicted;

@@ -4,6 +4,7 @@ use super::another_law::{AnotherLaw, Term};
 use super::block::Column;
 use super::causes::{LawTerm, UnknownLaw};
 use super::law::Place;
+use super::residuals::Formula;
 use super::system::{Predicted, System};
 
 /// Standard deviations of angles, relative to those of torques [rad/(N·m)].
@@ -36,15 +37,6 @@ struct Measured {
 struct Scales {
     means: [f64; 6],
     stds: [f64; 6],
-}
-
-/// A function at a joint in physical units.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Formula {
-    /// Formula of position q [rad], velocity dq [rad/s], position error e [rad], torque tau [N·m], temperature T [°C] and time t [s].
-    pub text: String,
-    /// Factor of the formula for a torque of 1 N·m, root mean square; of an angle between encoder and link [rad] for Place::Link.
-    pub per_torque: f64,
 }
 
 const fn function(
