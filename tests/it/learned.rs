@@ -393,6 +393,27 @@ fn residual_that_was_trained_with_a_base_policy_is_written_with_it_as_one_policy
 }
 
 #[test]
+fn residual_is_trained_on_the_robots_of_a_server_that_has_the_networks() {
+    let (folder, model) = model_with(description(), "", "");
+    let base = twinstep_tests::python::root().join("data/policies/walk.safetensors");
+    let config = folder.path().join("server.toml");
+    std::fs::write(&config, format!("[task]\nname = \"explore\"\nbase = \"{}\"\n", base.display())).unwrap();
+    let serve = ["serve", "--listen", "tcp/127.0.0.1:0", "--until-stdin-closes", "--envs", "320", "--task", "explore"];
+    let files = ["--config", config.to_str().unwrap(), "--model", model.to_str().unwrap()];
+    let serve: Vec<String> = serve.iter().chain(&files).map(ToString::to_string).collect();
+    let program = Programs::beside(env!("CARGO_BIN_EXE_faults")).unwrap().twinstep();
+    let (_server, endpoint) = Process::listening(&program, &serve).unwrap();
+    let without = train(folder.path(), &["explore", "--endpoint", &endpoint]);
+    let text = String::from_utf8_lossy(&without.stderr).into_owned();
+    assert!(without.status.code() == Some(2) && text.contains("`--base` is missing"), "{text}");
+    let trained = train(folder.path(), &["explore", "--endpoint", &endpoint, "--base", base.to_str().unwrap()]);
+    assert!(trained.status.success(), "{}", String::from_utf8_lossy(&trained.stderr));
+    let out = folder.path().join("out");
+    assert_eq!(Policy::read(out.join("policy.safetensors")).unwrap().0.spec.task, "explore");
+    assert!(out.join("exploration.safetensors").exists() && out.join("evaluation.json").exists());
+}
+
+#[test]
 fn settings_that_actuator_networks_do_not_support_are_rejected_by_name() {
     let (_folder, model) = model_with(description(), "", "");
     let check = |change: fn(&mut Config), expected: &str| {

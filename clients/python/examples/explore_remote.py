@@ -42,7 +42,7 @@ def train_rust(args: argparse.Namespace, seed: int, out: Path, is_remote: bool) 
     """Train with ``twinstep train``, in its process or on the robots of a server."""
     config = args.out / "server.toml"
     command = [find_program(), "train", "explore", "--out", str(out), "--seed", str(seed), "--steps", str(args.steps)]
-    command += ["--envs", str(args.envs)]
+    command += ["--envs", str(args.envs), "--base", str(args.base)]
     if is_remote:
         # Its process evaluates 256 robots at the end.
         server = EmbeddedServer(
@@ -52,7 +52,7 @@ def train_rust(args: argparse.Namespace, seed: int, out: Path, is_remote: bool) 
         subprocess.run(command, check=True, capture_output=True)
         server.release()
     else:
-        local = ["--config", str(config), "--model", args.model, "--base", str(args.base)]
+        local = ["--config", str(config), "--model", args.model]
         subprocess.run([*command, *local], check=True, capture_output=True)
     with (out / "progress.csv").open() as file:
         rows = list(csv.DictReader(file))

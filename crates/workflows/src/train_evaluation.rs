@@ -1,6 +1,6 @@
 //! Evaluation of a policy at the end of its training.
 
-use twinstep_envs::{JumpConfig, TaskConfig};
+use twinstep_envs::{JumpConfig, TaskConfig, WalkConfig};
 use twinstep_measures::{
     AttitudeErrors, AttitudeFollowing, Evaluation, JUMP_S, Jumping, Landings, Measure, MeasureError, PoseErrors,
     PoseFollowing, Run, Walking, measure,
@@ -93,7 +93,8 @@ fn walking(
     observer: &Observer,
 ) -> Result<Evaluation, Failure> {
     let fresh = fresh(config, config.task.with_default_settings());
-    let robot = fresh.robots(1)?.control();
+    // The task of servers may need what this process lacks, such as actuator networks.
+    let robot = self::fresh(config, TaskConfig::Walk(WalkConfig::default())).robots(1)?.control();
     let new = |spec: &EnvSpec, robots| Walking::new(spec, robots, &robot.feet, &robot.torque_limits);
     if endpoints.is_empty() {
         return measured(policy, &fresh, RUN, observer, new);

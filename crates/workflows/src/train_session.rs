@@ -80,6 +80,12 @@ impl TrainSession {
             }
         };
         let base = match &config.task {
+            TaskConfig::Explore(explore) if explore.base.as_os_str().is_empty() => {
+                return Err(Failure::Input(miette::miette!(
+                    "`--base` is missing: the trained residual is also written with its base policy, as one policy\n  \
+                     pass the policy of the servers: --base FILE"
+                )));
+            }
             TaskConfig::Explore(explore) => Some(Policy::read(&explore.base).map_err(input)?.0),
             _ => None,
         };
