@@ -74,6 +74,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="with a folder for each suite, as score.py leaves it")
     parser.add_argument("--seed", type=int, required=True, help="of the first suite; the next ones have the next seeds")
     parser.add_argument("--commit", required=True, help="of the program")
+    parser.add_argument("--note", default="", help="paragraph before the tables")
     args = parser.parse_args()
     suites = [suite for suite in SUITES if (args.folder / suite / "score_now.json").exists()]
     drawn = {suite: len(list((args.folder / suite).glob("case_*/truth.json"))) for suite in suites}
@@ -97,6 +98,7 @@ def main() -> None:
         "",
         "The number after a cause is its evidence [nat]. The predicted gain is the reduction of the joint error on the",
         "held-out blocks (`promise` in `findings.json`). Not measured: logs without motor currents.",
+        *(["", args.note] if args.note else []),
         *(line for suite in suites for line in section(args.folder, suite)),
     ]
     print("\n".join(lines))

@@ -28,14 +28,15 @@ Result = tuple[float, float, float]
 """Environment steps per second, uncertainty [nat], falls a minute."""
 
 
-def judged(policy: Path, model: str, config: Path) -> ExplorationMeasure:
+def judged(policy: Path, args: argparse.Namespace) -> ExplorationMeasure:
     """Return what a policy of ``twinstep train`` explores."""
     session = onnxruntime.InferenceSession(str(policy), providers=["CPUExecutionProvider"])
 
     def act(obs: NDArray[np.float32]) -> NDArray[np.float32]:
         return np.asarray(session.run(["action"], {"obs": obs})[0], np.float32)
 
-    return evaluate_exploration(act, model=model, config=str(config))
+    config = str(args.out / "server.toml")
+    return evaluate_exploration(act, uncertainty_weight=args.uncertainty_weight, model=args.model, config=config)
 
 
 def train_rust(args: argparse.Namespace, seed: int, out: Path, is_remote: bool) -> Result:
@@ -57,13 +58,14 @@ def train_rust(args: argparse.Namespace, seed: int, out: Path, is_remote: bool) 
     with (out / "progress.csv").open() as file:
         rows = list(csv.DictReader(file))
     seconds = sum(float(row["rollout_s"]) + float(row["update_s"]) for row in rows)
-    found = judged(out / "policy.onnx", args.model, config)
+    found = judged(out / "policy.onnx", args)
     return float(rows[-1]["env_steps"]) / seconds, found.uncertainty, found.falls_per_minute
 
 
 def train_example(args: argparse.Namespace, seed: int, out: Path, name: str) -> Result:
     """Train with an example of the Python client."""
     command = [sys.executable, str(EXAMPLES / name), "--model", args.model, "--base", str(args.base)]
+    command += ["--uncertainty-weight", str(args.uncertainty_weight)]
     command += ["--envs", str(args.envs), "--steps", str(args.steps), "--seed", str(seed), "--out", str(out)]
     printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     line = re.search(r"([\d.]+) a second: uncertainty ([\d.]+) nat, ([\d.]+) falls", printed)
@@ -75,13 +77,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--model", required=True, help="model file with an [actuator] table")
     parser.add_argument("--base", type=Path, required=True, help="policy of `walk`: policy.safetensors")
+    parser.add_argument("--uncertainty-weight", type=float, default=10.0, help="per second and nat")
     parser.add_argument("--envs", type=int, default=1024)
     parser.add_argument("--steps", type=int, default=2_000_000, help="environment steps of one training")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--out", type=Path, default=Path("remote-exploration"))
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
-    write_config(args.out / "server.toml", args.base)
+    write_config(args.out / "server.toml", args.base, uncertainty_weight=args.uncertainty_weight)
     ways: dict[str, Callable[[int, Path], Result]] = {
         "twinstep train, in process": lambda seed, out: train_rust(args, seed, out, is_remote=False),
         "twinstep train, over the wire": lambda seed, out: train_rust(args, seed, out, is_remote=True),
@@ -94,7 +97,10 @@ def main() -> None:
             found[way].append(train(seed, args.out / f"{seed}-{index}"))
             print(seed, way, found[way][-1], file=sys.stderr, flush=True)
     idle = evaluate_exploration(
-        lambda obs: np.zeros((len(obs), 12), np.float32), model=args.model, config=str(args.out / "server.toml")
+        lambda obs: np.zeros((len(obs), 12), np.float32),
+        uncertainty_weight=args.uncertainty_weight,
+        model=args.model,
+        config=str(args.out / "server.toml"),
     )
     print("| trained by | env-steps/s, median | uncertainty by seed [nat] | mean | falls a minute, mean |")
     print("|---|---|---|---|---|")
