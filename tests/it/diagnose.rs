@@ -67,6 +67,7 @@ fn hidden_friction_is_found_with_its_scope_and_size_and_the_extended_model_fits(
     let promise = diagnosis.promise.expect("positions are compared").all;
     let [low, high] = promise.interval;
     assert!((promise.found - (1.0 - after / before)).abs() < 0.02, "{promise:?}");
+    // The last fifth of a chirp is faster than those before: what is found, 0.897, is just outside the interval, 0.904 to 0.921.
     assert!(
         (promise.found - promise.predicted).abs() < 0.05 && low < promise.predicted && high - low < 0.3,
         "{promise:?}"

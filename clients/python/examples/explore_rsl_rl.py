@@ -7,44 +7,16 @@ policy of ``walk``, to whose actions the trained policy adds a bounded residual 
 import argparse
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from ppo_rsl_rl import STEPS_PER_ENV, config
 from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
 
 from twinstep.exploration import evaluate_exploration, write_config
 from twinstep.rsl_rl import make_vec_env
-
-STEPS_PER_ENV = 24
-MODEL = {"class_name": "MLPModel", "hidden_dims": [128, 128], "activation": "relu", "obs_normalization": True}
-
-
-def settings(seed: int) -> dict[str, Any]:
-    """Return the settings of the runner."""
-    gaussian = {"class_name": "GaussianDistribution", "init_std": 0.5}
-    algorithm = {
-        "class_name": "PPO",
-        "num_learning_epochs": 2,
-        "num_mini_batches": 4,
-        "gamma": 0.98,
-        "lam": 0.95,
-        "entropy_coef": 5e-4,
-        "learning_rate": 1e-3,
-        "schedule": "adaptive",
-        "desired_kl": 0.01,
-    }
-    return {
-        "seed": seed,
-        "num_steps_per_env": STEPS_PER_ENV,
-        "save_interval": 100,
-        "obs_groups": {"actor": ["policy"], "critic": ["policy", "critic"]},
-        "algorithm": algorithm,
-        "actor": {**MODEL, "distribution_cfg": gaussian},
-        "critic": dict(MODEL),
-    }
 
 
 def main() -> None:
@@ -63,17 +35,17 @@ def main() -> None:
     # The network is too small for several threads, which would take cores from the server's simulation.
     torch.set_num_threads(1)
 
-    config = args.out / "server.toml"
-    write_config(config, args.base, uncertainty_weight=args.uncertainty_weight)
+    server = args.out / "server.toml"
+    write_config(server, args.base, uncertainty_weight=args.uncertainty_weight)
     envs = make_vec_env(
         "twinstep/Go2-Explore-v0",
         num_envs=args.envs,
         seed=args.seed,
         critic=True,
         model=args.model,
-        config=str(config),
+        config=str(server),
     )
-    runner = OnPolicyRunner(envs, settings(args.seed), log_dir=str(args.out), device="cpu")
+    runner = OnPolicyRunner(envs, config(args.seed), log_dir=str(args.out), device="cpu")
     iterations = max(1, args.steps // (STEPS_PER_ENV * args.envs))
     runner.learn(iterations, init_at_random_ep_len=True)
     policy = runner.get_inference_policy()
@@ -84,7 +56,7 @@ def main() -> None:
         with torch.inference_mode():
             return policy(TensorDict({"policy": torch.from_numpy(obs)}, batch_size=[len(obs)])).numpy()
 
-    found = evaluate_exploration(act, uncertainty_weight=args.uncertainty_weight, model=args.model, config=str(config))
+    found = evaluate_exploration(act, uncertainty_weight=args.uncertainty_weight, model=args.model, config=str(server))
     steps = iterations * STEPS_PER_ENV * args.envs
     print(f"{steps} steps in {seconds:.0f} s, {steps / seconds:.0f} a second: {found}")
 

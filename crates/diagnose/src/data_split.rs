@@ -17,7 +17,7 @@ const DIVIDED_S: f64 = 5.0;
 /// Length of the gap before a held-out block [s].
 const GAP_S: f64 = 0.5;
 /// Every so-many-th part of the rows is held out.
-const PARTS: usize = 5;
+pub const PARTS: usize = 5;
 
 /// Role of a row.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -14,11 +14,11 @@ use twinstep_identify::evaluate::position_errors;
 use twinstep_logs::Log;
 use twinstep_model::{RobotModel, Rollout};
 
-use super::ExperimentError;
 use super::findings::{Promise, Reduction};
+use super::{ExperimentError, data_split};
 
-/// Parts of the fitted rows of a motion: the held-out rows are a fifth of all.
-const PARTS: usize = 4;
+/// Parts of the fitted rows of a motion, as long as the held-out one.
+const PARTS: usize = data_split::PARTS - 1;
 /// 95 % quantiles of Student's t with one, two and three degrees of freedom.
 const STUDENT_95: [f64; PARTS - 1] = [6.314, 2.920, 2.353];
 

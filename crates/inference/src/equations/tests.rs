@@ -153,6 +153,45 @@ fn check_columns(log: &Log) {
     }
 }
 
+/// Columns that were computed for another robot are used again.
+#[test]
+fn columns_with_equal_fingerprints_are_equal() {
+    let (system, robot) = system();
+    let all = laws();
+    let with = |robot: &Robot, law: &Law, site: Site| {
+        let mut after = robot.clone();
+        let unknowns: Vec<f64> = law.form.units.iter().map(|unit| 0.3 * unit).collect();
+        apply(&mut after, law, site, &unknowns, law.shapes[0]);
+        after
+    };
+    let predicted = system.predicted(&robot);
+    let mut equal = 0;
+    for cause in &all {
+        let other = with(&robot, cause, site_of(cause));
+        let of_other = system.predicted(&other);
+        for law in &all {
+            let site = if site_of(law) == Site::Base { Site::Base } else { Site::Joint(4 + equal % 2) };
+            let print = |robot, predicted| super::system::fingerprint(law.form.place, site, robot, predicted);
+            let prints = [print(&robot, &predicted), print(&other, &of_other)];
+            if prints[0].is_none() || prints[0] != prints[1] {
+                continue;
+            }
+            let [column, same] = [(&robot, &predicted), (&other, &of_other)]
+                .map(|before| system.column(law, site, before, &with(before.0, law, site)));
+            let rows = |column: &Column| column.parts.iter().flat_map(|(_, rows)| rows.clone()).collect::<Vec<f64>>();
+            let largest = rows(&column).iter().zip(rows(&same)).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+            assert!(
+                column.parts.len() == same.parts.len() && largest < 1e-9,
+                "{} beside {}",
+                law.effect.name,
+                cause.effect.name
+            );
+            equal += 1;
+        }
+    }
+    assert!(equal > 100, "{equal}");
+}
+
 /// Friction between motor and sensor changes what the sensor reads, and no balance of the link.
 #[test]
 fn friction_is_seen_by_a_sensor_at_the_output_and_by_the_balance_if_the_current_is_measured() {
