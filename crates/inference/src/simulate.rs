@@ -11,7 +11,7 @@ use crate::{Candidate, InferenceError, JointLog, Window};
 /// Robots that one core simulates together: full lanes, and few enough for its cache.
 const TOGETHER: usize = 64;
 /// Robots that one core steps at once.
-const LANES: usize = 4;
+const LANES: usize = 8;
 
 /// Simulated signals in a window: one list for each joint of the log, with one entry for each row.
 #[derive(Clone, Debug, PartialEq)]

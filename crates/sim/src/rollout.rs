@@ -18,7 +18,7 @@ use crate::{BackendBuildError, SimConfig};
 fn batch_size(precision: Precision) -> usize {
     match precision {
         Precision::Single => 16,
-        Precision::Double => 4,
+        Precision::Double => 8,
     }
 }
 

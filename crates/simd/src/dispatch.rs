@@ -4,7 +4,7 @@ use crate::float::SimdFloat;
 use crate::instruction_set::{InstructionSet, Level};
 use crate::portable::F32x4;
 #[cfg(target_arch = "x86_64")]
-use crate::x86::{Avx2F32, Avx2F64, Avx512F32, Sse2F32};
+use crate::x86::{Avx2F32, Avx2F64, Avx512F32, Avx512F64, Sse2F32};
 
 /// Code that is generic over the register type.
 pub trait SimdTask {
@@ -28,13 +28,13 @@ pub fn with_f32<K: SimdTask>(instructions: InstructionSet, task: K) -> K::Output
     }
 }
 
-/// Runs `task` on double-precision registers of an instruction set: four lanes from AVX2 on, one lane otherwise.
+/// Runs `task` on double-precision registers of an instruction set: eight lanes of AVX-512, four of AVX2, one lane otherwise.
 pub fn with_f64<K: SimdTask>(instructions: InstructionSet, task: K) -> K::Output {
     match instructions.0 {
         #[cfg(target_arch = "x86_64")]
-        Level::Avx512 if !InstructionSet::available().contains(&InstructionSet(Level::Avx2)) => task.run::<f64>(),
+        Level::Avx512 => task.run::<Avx512F64>(),
         #[cfg(target_arch = "x86_64")]
-        Level::Avx512 | Level::Avx2 => task.run::<Avx2F64>(),
+        Level::Avx2 => task.run::<Avx2F64>(),
         #[cfg(target_arch = "x86_64")]
         Level::Sse2 => task.run::<f64>(),
         Level::Portable => task.run::<f64>(),

@@ -216,6 +216,20 @@ register! {
     any _mm256_movemask_pd(_mm256_cmp_pd::<_CMP_LT_OQ>(value, limit)) != 0
 }
 
+register! {
+    /// Eight lanes of double precision in a register of AVX-512.
+    Avx512F64(__m512d): 8 of f64, "avx512f", sin_cos_double,
+    _mm512_set1_pd, _mm512_add_pd, _mm512_sub_pd, _mm512_mul_pd, _mm512_div_pd, _mm512_sqrt_pd, _mm512_max_pd,
+    _mm512_min_pd,
+    |value| _mm512_castsi512_pd(_mm512_xor_si512(_mm512_castpd_si512(value), _mm512_set1_epi64(i64::MIN))),
+    |value, factor, summand| Self(unsafe { _mm512_fmadd_pd(value.0, factor.0, summand.0) }),
+    |power| Self(unsafe { _mm512_castsi512_pd(_mm512_slli_epi64::<52>(_mm512_add_epi64(
+        _mm512_cvtepi32_epi64(_mm512_cvtpd_epi32(power.0)), _mm512_set1_epi64(1023)))) }),
+    |value, limit, then, otherwise|
+        _mm512_mask_blend_pd(_mm512_cmp_pd_mask::<_CMP_LT_OQ>(value, limit), otherwise, then),
+    any _mm512_cmp_pd_mask::<_CMP_LT_OQ>(value, limit) != 0
+}
+
 /// `value · factor + summand`, rounded once, for registers without such an instruction.
 #[inline(always)]
 fn lane_by_lane_mul_add(mut value: Sse2F32, factor: Sse2F32, summand: Sse2F32) -> Sse2F32 {
