@@ -10,8 +10,6 @@ use crate::{Candidate, InferenceError, JointLog, Window};
 
 /// Robots that one core simulates together: full lanes, and few enough for its cache.
 const TOGETHER: usize = 64;
-/// Robots that one core steps at once.
-const LANES: usize = 8;
 
 /// Simulated signals in a window: one list for each joint of the log, with one entry for each row.
 #[derive(Clone, Debug, PartialEq)]
@@ -39,7 +37,8 @@ pub fn simulate(
         .flat_map(|candidate| windows.iter().zip(&clocks).map(move |(window, clock)| (candidate, window, clock)))
         .map(|(index, window, clock)| Job { log, robot: &robots[index], candidate: &candidates[index], window, clock })
         .collect();
-    let together = jobs.len().div_ceil(rayon::current_num_threads()).next_multiple_of(LANES).clamp(LANES, TOGETHER);
+    let lanes = SimdPrecision::Double.lanes();
+    let together = jobs.len().div_ceil(rayon::current_num_threads()).next_multiple_of(lanes).clamp(lanes, TOGETHER);
     let groups: Vec<_> =
         jobs.par_chunks(together).map(|jobs| run(jobs, actuator_hz, stop)).collect::<Result<_, _>>()?;
     let mut traces = groups.into_iter().flatten();

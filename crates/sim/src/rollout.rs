@@ -8,19 +8,10 @@ use twinstep_model::{
     Actuator, Command, Ground, HistoryStep, NUM_JOINTS, PerJoint, Precision, RobotModel, RobotStates, Rollout,
     RolloutRequest,
 };
-use twinstep_simd::InstructionSet;
 
 use crate::actuator_input::ActuatorInputs;
 use crate::batch::{BatchSimulator, SimdPrecision, StepCount, batch_simulator};
 use crate::{BackendBuildError, SimConfig};
-
-/// Returns the number of candidates in a batch: the lanes of the widest register of any processor.
-fn batch_size(precision: Precision) -> usize {
-    match precision {
-        Precision::Single => 16,
-        Precision::Double => 8,
-    }
-}
 
 /// Creates the external actuators of robots, given their number and a robot with their rates.
 type ActuatorFactory = dyn Fn(usize, &RobotModel) -> Box<dyn Actuator> + Send + Sync;
@@ -55,14 +46,10 @@ impl BatchRollout {
 
     /// Runs requests that have one base mount and one actuator rate.
     fn run_batch(&self, jobs: &[&RolloutRequest], precision: Precision) -> Vec<RobotStates> {
-        let lanes = match precision {
-            Precision::Single => SimdPrecision::Single(InstructionSet::best()),
-            Precision::Double => SimdPrecision::Double,
-        };
         let mut robot = self.robot.clone();
         robot.control.actuator_hz = jobs[0].robot.control.actuator_hz;
         let config = SimConfig { base: jobs[0].base, ..self.config }.at_actuator_rate(robot.control.actuator_hz);
-        let mut robots = batch_simulator(lanes, &robot, &config, &Ground::FLAT, &jobs[0].start, jobs.len());
+        let mut robots = batch_simulator(precision.into(), &robot, &config, &Ground::FLAT, &jobs[0].start, jobs.len());
         let mut start = RobotStates::new(jobs.len());
         let mut records: Vec<_> = jobs.iter().map(|job| RobotStates::new(job.commands.len() + 1)).collect();
         for (robot, (job, record)) in jobs.iter().zip(&mut records).enumerate() {
@@ -139,7 +126,7 @@ impl ActuatedRobots<'_> {
 
 impl Rollout for BatchRollout {
     fn run(&mut self, jobs: &[RolloutRequest], precision: Precision) -> Vec<RobotStates> {
-        let (this, size) = (&*self, batch_size(precision));
+        let (this, size) = (&*self, SimdPrecision::from(precision).lanes());
         // Sorted by length, so that the candidates of a batch have similar lengths.
         let mut order: Vec<usize> = (0..jobs.len()).collect();
         order.sort_by_key(|index| Reverse(jobs[*index].commands.len()));

@@ -253,10 +253,10 @@ mod tests {
     struct OnRegisters<T>(T, T);
 
     impl<T: SimdFloat> SimdKernel for OnRegisters<T> {
-        type Output = [u64; 14];
+        type Output = [u64; 16];
 
         #[inline(always)]
-        fn run(self) -> [u64; 14] {
+        fn run(self) -> [u64; 16] {
             let Self(x, y) = self;
             let (sin, cos) = x.sin_cos();
             let selected = x.select_lt(y, x * x, y);
@@ -264,6 +264,10 @@ mod tests {
             let mut memory = [0.0; 16];
             x.store(&mut memory[..T::LANES]);
             let copied = T::load(&memory);
+            let zero = T::splat(0.0);
+            let mut last = zero;
+            last.set(T::LANES - 1, 1.0);
+            let is_any = |found: bool| T::splat(f64::from(u8::from(found)));
             let results = [
                 x + y,
                 x - y,
@@ -279,6 +283,8 @@ mod tests {
                 sin,
                 cos,
                 copied,
+                is_any(x.any_lt(y)),
+                is_any(zero.any_lt(last)),
             ];
             // The payload of a NaN differs between processors.
             results.map(|result| {
@@ -289,9 +295,9 @@ mod tests {
     }
 
     impl SimdTask for EveryOperation {
-        type Output = [u64; 14];
+        type Output = [u64; 16];
 
-        fn run<T: SimdFloat>(self) -> [u64; 14] {
+        fn run<T: SimdFloat>(self) -> [u64; 16] {
             T::vectorise(OnRegisters(T::splat(self.0), T::splat(self.1)))
         }
     }

@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use twinstep_dynamics::quadruped::FactoredDynamics;
 use twinstep_dynamics::{SimdCommands, StepEquations};
 use twinstep_model::{
-    Ground, HistoryStep, InitialState, PerJoint, RobotModel, RobotStates, RobotStatesMut, RolloutRequest,
+    Ground, HistoryStep, InitialState, PerJoint, Precision, RobotModel, RobotStates, RobotStatesMut, RolloutRequest,
 };
 use twinstep_simd::{InstructionSet, SimdFloat, SimdKernel, SimdTask, with_f32, with_f64};
 
@@ -22,6 +22,36 @@ pub enum SimdPrecision {
     Single(InstructionSet),
     /// Double precision in the widest registers of the processor, for system identification.
     Double,
+}
+
+impl SimdPrecision {
+    /// Returns the number of robots that one core steps at once: the lanes of a register.
+    pub fn lanes(self) -> usize {
+        match self {
+            Self::Single(instructions) => with_f32(instructions, LaneCount),
+            Self::Double => with_f64(InstructionSet::best(), LaneCount),
+        }
+    }
+}
+
+impl From<Precision> for SimdPrecision {
+    /// The widest registers of the processor.
+    fn from(precision: Precision) -> Self {
+        match precision {
+            Precision::Single => Self::Single(InstructionSet::best()),
+            Precision::Double => Self::Double,
+        }
+    }
+}
+
+struct LaneCount;
+
+impl SimdTask for LaneCount {
+    type Output = usize;
+
+    fn run<T: SimdFloat>(self) -> usize {
+        T::LANES
+    }
 }
 
 /// Robots in batches of any register type.
