@@ -1,8 +1,12 @@
 //! Factories of the environments of a lease.
 
-use twinstep_effects::{ModelFile, ModelFileError, NetworkMode, NominalRobotError, RobotSampler, SamplingError};
+use twinstep_effects::{
+    ControlTable, ModelFile, ModelFileError, NetworkMode, NominalRobotError, RobotSampler, SamplingError,
+};
 use twinstep_ensemble::{ActuatorNetworkRobot, EnsembleError};
-use twinstep_envs::{Attitude, CounterEnv, GaitTask, Jump, Task, TaskConfig, TaskEnv, TaskEnvConfig, Track, Walk};
+use twinstep_envs::{
+    Attitude, CounterEnv, GaitTask, Getup, Jump, Task, TaskConfig, TaskEnv, TaskEnvConfig, Track, Walk,
+};
 use twinstep_model::{Actuator, AutoresetMode, Backend, EnvSpec, RobotModel, VecEnv};
 use twinstep_policy::array_file::ArrayFileError;
 use twinstep_policy::{OtherBase, Policy, ResidualEnv};
@@ -132,9 +136,10 @@ impl SimEnvFactory {
             Some(path) => ModelFile::load(path)?,
             None => ModelFile::default(),
         };
-        let file = match &config.control {
-            Some(control) => file.with_control(control)?,
-            None => file,
+        let control = config.control.clone().unwrap_or_default();
+        let file = match control.action_scale.or(config.task.action_scale()) {
+            None if config.control.is_none() => file,
+            action_scale => file.with_control(&ControlTable { action_scale, ..control })?,
         };
         let learned = ActuatorNetworkRobot::load(&file)?;
         check_actuators(&config, learned.as_ref())?;
@@ -260,6 +265,7 @@ pub fn task_spec(config: &TaskConfig, robot: &RobotModel, has_ground_truth: bool
         TaskConfig::Jump(config) => Jump::new(config, robot, has_ground_truth)?.spec().clone(),
         TaskConfig::Gait(config) => GaitTask::new(config, robot, has_ground_truth)?.spec().clone(),
         TaskConfig::Attitude(config) => Attitude::new(config, robot, has_ground_truth)?.spec().clone(),
+        TaskConfig::Getup(config) => Getup::new(config, robot, has_ground_truth)?.spec().clone(),
         TaskConfig::Explore(config) => Walk::new(config.weighted_walk(), robot, has_ground_truth)?.spec().clone(),
         TaskConfig::Pose(_) | TaskConfig::Counter => return Err(EnvFactoryError::TaskOfTrees),
     })
@@ -275,6 +281,7 @@ pub fn check_measurable(config: &TaskConfig) -> Result<(), EnvFactoryError> {
             "it observes its position on the path, which no sensor of the robot measures: set `observe_pose_error = false`"
         }
         TaskConfig::Explore(_) => "its reward needs actuator networks; run the policy that it trained as `walk`",
+        TaskConfig::Getup(_) => "the driver stops the motors of a robot that lies",
         TaskConfig::Pose(_) => "it is for simulated robots of any shape",
         TaskConfig::Counter => "it has no robot",
     };
@@ -308,6 +315,10 @@ pub fn task_env(
         TaskConfig::Attitude(config) => {
             let attitude = Attitude::new(config.clone(), robot, has_ground_truth)?;
             Ok(Box::new(TaskEnv::new(backend, attitude, settings)?))
+        }
+        TaskConfig::Getup(config) => {
+            let getup = Getup::new(config.clone(), robot, has_ground_truth)?;
+            Ok(Box::new(TaskEnv::new(backend, getup, settings)?))
         }
         // The environments of the base policy; the residual is added to its actions by `ResidualEnv`.
         TaskConfig::Explore(config) => {

@@ -316,6 +316,23 @@ fn shipped_policy_follows_a_circle_a_figure_of_eight_and_a_square() {
     assert!(of_seed("1") == of_seed("1") && of_seed("1") != of_seed("2"), "the seed is that of the robots");
 }
 
+/// A third of the robots starts upside down; in rapier, which the policy has not seen, thighs touch the ground as well.
+#[test]
+fn shipped_policy_gets_up_from_any_orientation_in_two_engines() {
+    let policy = root().join("data/policies/getup.safetensors");
+    let options = ["--robots", "64", "--condition", "nominal", "--condition", "robots", "--json"];
+    let evaluated = twinstep(&[&["evaluate-policy", policy.to_str().unwrap()][..], &options].concat());
+    assert!(evaluated.status.success(), "{}", text(&evaluated.stderr));
+    let report: serde_json::Value = serde_json::from_slice(&evaluated.stdout).unwrap();
+    let rows = report["rows"].as_array().unwrap();
+    let engines: Vec<&str> = rows.iter().map(|row| row["engine"].as_str().unwrap()).collect();
+    assert_eq!(engines, ["batch", "rapier", "batch"]);
+    for row in rows {
+        let number = |name: &str| row[name].as_f64().unwrap();
+        assert!(number("within_3_s") > 0.8 && number("at_end") > 0.9 && number("median_s") < 1.5, "{row}");
+    }
+}
+
 #[test]
 fn shipped_policy_follows_roll_and_pitch_in_two_engines() {
     let policy = root().join("data/policies/attitude.safetensors");

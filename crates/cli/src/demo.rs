@@ -4,7 +4,7 @@
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::ProgressBar;
 use twinstep_client::{ConnectOptions, RemoteVecEnv};
 use twinstep_model::{ResetRequest, VecEnv, go2};
 use twinstep_sim::SimConfig;
@@ -76,10 +76,8 @@ fn walk(args: &Args, policy: &Path, signals: &Signals) -> CommandResult {
     let mut obs = env.reset(&ResetRequest::seeded(1, num_envs)).map_err(other)?.to_vec();
     let dt = env.spec().policy_dt;
     let steps = (f64::from(args.seconds) / dt) as u64;
-    let bar = ProgressBar::with_draw_target(Some(steps * num_envs as u64), progress_lines::target()).with_style(
-        ProgressStyle::with_template("   {bar:32} {pos}/{len} env-steps  {per_sec}  ETA {eta}")
-            .expect("the template is valid"),
-    );
+    let bar = ProgressBar::with_draw_target(Some(steps * num_envs as u64), progress_lines::target())
+        .with_style(progress_lines::style("   {bar:32} {pos}/{len} env-steps  {per_sec}  ETA {eta}"));
     let (since, mut falls) = (Instant::now(), 0);
     let mut actions = vec![0.0; num_envs * env.spec().action_len()];
     let mut frames = Vec::new();

@@ -15,7 +15,7 @@ use crate::serve::engine;
 /// every 5 s. A policy of `track` follows a circle, a figure of eight and a square, with and
 /// without motion capture. A policy of `gait` is commanded a trot, a pace, a bound and a pronk,
 /// under nominal, robots, pushes and delay. A policy of `attitude` follows sines of roll, pitch and
-/// height. A policy of `jump` jumps once to both ends and the middle of the ranges of its targets,
+/// height. A policy of `getup` gets up from any orientation. A policy of `jump` jumps once to both ends and the middle of the ranges of its targets,
 /// or to its only target. A robot that has fallen no longer counts for the errors, but its landing
 /// before the fall does. Conditions:
 ///

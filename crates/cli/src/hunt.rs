@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::ProgressBar;
 use twinstep_hunt::{HuntConfig, HuntError, Plant, Suite, hunt};
 use twinstep_workflows::progress_lines;
 
@@ -91,9 +91,8 @@ pub fn run(args: &Args) -> CommandResult {
         command
     };
     let signals = Signals::listen()?;
-    let style = ProgressStyle::with_template("{bar:30} {pos}/{len} cases, {per_sec}, ETA {eta}  {msg}");
-    let bar = ProgressBar::with_draw_target(Some(args.cases), progress_lines::target())
-        .with_style(style.expect("a template"));
+    let style = progress_lines::style("{bar:30} {pos}/{len} cases, {per_sec}, ETA {eta}  {msg}");
+    let bar = ProgressBar::with_draw_target(Some(args.cases), progress_lines::target()).with_style(style);
     let plant = match args.plant {
         PlantName::Rapier => Plant::Rapier,
         PlantName::Mujoco => Plant::Mujoco,

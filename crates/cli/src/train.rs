@@ -35,7 +35,7 @@ use crate::web_view::ViewArgs;
 #[allow(clippy::struct_excessive_bools, reason = "each is a flag of the command")]
 pub struct Args {
     /// Task to learn. Default: that of the config file, else walk.
-    #[arg(value_parser = ["walk", "track", "jump", "gait", "attitude", "explore", "pose"])]
+    #[arg(value_parser = ["walk", "track", "jump", "gait", "attitude", "explore", "getup", "pose"])]
     task: Option<String>,
     /// Folder to write.
     #[arg(long, value_name = "DIR")]
@@ -137,7 +137,8 @@ impl Args {
                     "`{task}` is not the task of the config file, `{of_config}`\n  name the same task, or none"
                 )));
             }
-            config.task = TaskConfig::named(task).expect("the argument was checked");
+            let of_task = TrainConfig::of_task(task).expect("the argument was checked");
+            config = if self.config.is_none() { of_task } else { TrainConfig { task: of_task.task, ..config } };
         }
         match (&mut config.task, &self.base) {
             (TaskConfig::Explore(explore), base) => {

@@ -43,6 +43,6 @@ pub use randomise::Randomisation;
 pub use task::{RobotView, Step, Task, Truth, observe_next, repeat_first_frame};
 pub use task_env::{TaskEnv, TaskEnvConfig};
 pub use tasks::{
-    Attitude, AttitudeConfig, ExploreConfig, Gait, GaitConfig, GaitTask, Jump, JumpConfig, PoseConfig, PoseState,
-    PoseTask, TaskConfig, Track, TrackConfig, Walk, WalkConfig, roll_and_pitch,
+    Attitude, AttitudeConfig, ExploreConfig, Gait, GaitConfig, GaitTask, Getup, GetupConfig, Jump, JumpConfig,
+    PoseConfig, PoseState, PoseTask, TaskConfig, Track, TrackConfig, Walk, WalkConfig, roll_and_pitch,
 };

@@ -1,5 +1,6 @@
 //! Interface of a task: observations, reward terms and the end of an episode.
 
+use glam::Quat;
 use twinstep_model::{EnvSpec, GaitCommand, Ground, GroundTruth, Measured, Stream, VelocityCommand};
 
 /// A task on one robot. [`crate::TaskEnv`] runs it on many.
@@ -15,6 +16,11 @@ pub trait Task: Send {
 
     /// Starts an episode. Returns the initial joint positions [rad] and the state.
     fn start(&self, random: &mut Stream) -> (Vec<f32>, Self::State);
+
+    /// Returns the rotation of the base at the start, relative to a robot that stands on the ground.
+    fn start_rotation(&self, _state: &Self::State) -> Quat {
+        Quat::IDENTITY
+    }
 
     /// Completes the state of an episode whose robot is in place.
     fn place(&self, _state: &mut Self::State, _robot: &RobotView) {}

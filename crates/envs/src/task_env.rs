@@ -127,9 +127,10 @@ impl<B: Backend, T: Task> TaskEnv<B, T> {
                 .map_or([0.0; 3], |course| course.start(*env, walked_to.map(|[x, y, _]| [x, y]), &mut start.place));
             self.episodes[*env].set_commands(task, &self.agent_commands, *env);
             self.commands[*env].q = q;
+            let turned = task.start_rotation(&self.episodes[*env].state);
             let initial_state = InitialState {
                 actuator_seed: start.actuator_seed,
-                ..InitialState::standing_at(&self.ground, backend.robot(), q, START_CLEARANCE, place)
+                ..InitialState::turned_at(&self.ground, backend.robot(), q, START_CLEARANCE, place, turned)
             };
             match start.robot {
                 Some(robot) => backend.reset_with_model(*env, &robot, &initial_state)?,

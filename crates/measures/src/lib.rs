@@ -1,7 +1,7 @@
 //! What a policy does, measured by one loop.
 //!
 //! - [`measure`]: steps all robots of an environment with the mean action of a policy, and shows each step to a [`Measure`].
-//! - [`Walking`], [`Tracking`], [`GaitFollowing`], [`AttitudeFollowing`], [`Jumping`], [`PoseFollowing`]: a measure for each task.
+//! - [`Walking`], [`Tracking`], [`GaitFollowing`], [`AttitudeFollowing`], [`Jumping`], [`GettingUp`], [`PoseFollowing`]: a measure for each task.
 //! - [`CourseWalking`]: how steep and high a ground a policy of `walk` masters.
 //! - [`conditions`]: the robots, grounds and disturbances under which a policy is judged.
 //!
@@ -12,6 +12,7 @@ mod attitude;
 mod conditions;
 mod course;
 mod gait;
+mod getup;
 mod jump;
 mod pose;
 mod tracking;
@@ -21,6 +22,7 @@ pub use attitude::{AttitudeErrors, AttitudeFollowing};
 pub use conditions::{CONDITION_NAMES, Condition, conditions};
 pub use course::{CourseWalking, KindOfGround, Level};
 pub use gait::{GaitFollowing, GaitMotion};
+pub use getup::{GETUP_S, GettingUp, GettingUpTimes};
 pub use jump::{JUMP_S, Jumping, Landings};
 pub use pose::{PoseErrors, PoseFollowing};
 pub use tracking::{Tracking, TrackingErrors};

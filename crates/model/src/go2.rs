@@ -94,10 +94,13 @@ fn joint(joint: Joint) -> JointModel {
     }
 }
 
-/// Source: menagerie's geoms of the trunk, a thigh and a foot. The cylinder of the calf is a capsule here.
+/// Source: menagerie's geoms of the trunk, a hip, a thigh and a foot. The cylinder of the hip is a sphere here, and that of the calf
+/// a capsule.
 fn shapes() -> Shapes {
     Shapes {
         trunk_half_size: dvec3(0.1881, 0.046_75, 0.057),
+        hip_centre: dvec3(0.0, 0.08, 0.0),
+        hip_radius: 0.046,
         thigh_half_size: dvec3(0.017, 0.012_25, 0.1065),
         thigh_centre: dvec3(0.0, 0.0, -0.1065),
         calf_radius: 0.012,

@@ -2,7 +2,7 @@
 
 use glam::{Quat, Vec3};
 
-use crate::{Ground, NUM_JOINTS, PerJoint, Pose, RobotModel, body_poses, frames};
+use crate::{Ground, Leg, NUM_JOINTS, PerJoint, Pose, RobotModel, body_poses, frames};
 
 /// State to which a robot is reset.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -40,34 +40,41 @@ impl InitialState {
     /// Returns the state at rest above the origin of `ground`, parallel to its plane, with joints at `q` [rad].
     ///
     /// The collision point with the least distance to the ground is `clearance` [m] above it. The points are the feet,
-    /// the knees, the calf ends and the lower corners of the trunk.
+    /// the knees, the calf ends, the hips and the corners of the trunk.
     pub fn standing_on(ground: &Ground, robot: &RobotModel, q: PerJoint, clearance: f32) -> Self {
         Self::standing_at(ground, robot, q, clearance, [0.0; 3])
     }
 
     /// Returns the state as [`InitialState::standing_on`] does, above another point of the ground: x [m], y [m], and the yaw
     /// of the robot [rad].
-    pub fn standing_at(
+    pub fn standing_at(ground: &Ground, robot: &RobotModel, q: PerJoint, clearance: f32, place: [f32; 3]) -> Self {
+        Self::turned_at(ground, robot, q, clearance, place, Quat::IDENTITY)
+    }
+
+    /// Returns the state as [`InitialState::standing_at`] does, with the base turned from there by a rotation in its own frame.
+    pub fn turned_at(
         ground: &Ground,
         robot: &RobotModel,
         q: PerJoint,
         clearance: f32,
         [x, y, yaw]: [f32; 3],
+        turned: Quat,
     ) -> Self {
-        let rotation = Quat::from_rotation_arc(Vec3::Z, ground.up()) * Quat::from_rotation_z(yaw);
+        let rotation = Quat::from_rotation_arc(Vec3::Z, ground.up()) * Quat::from_rotation_z(yaw) * turned;
         let poses = body_poses(robot, Pose { position: Vec3::new(x, y, 0.0), rotation }, &q);
         let shapes = &robot.shapes;
         let half = shapes.trunk_half_size.as_vec3();
-        let corners = [(1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)].map(|(x, y)| half * Vec3::new(x, y, -1.0));
+        let sign = |corner: u32, axis: u32| if corner >> axis & 1 == 0 { -1.0 } else { 1.0 };
+        let corners = (0..8).map(|corner| half * Vec3::new(sign(corner, 0), sign(corner, 1), sign(corner, 2)));
         let trunk = corners.map(|corner| (poses[0].transform(corner), 0.0));
         let legs = (0..4).flat_map(|leg| {
-            let calf = poses[3 + 3 * leg];
-            let [knee, shin] = shapes.calf_ends.map(|end| (end, shapes.calf_radius));
-            [knee, shin, (shapes.foot_centre, shapes.foot_radius)]
-                .map(|(centre, radius)| (calf.transform(centre.as_vec3()), radius as f32))
+            let (hip, calf) = (poses[1 + 3 * leg], poses[3 + 3 * leg]);
+            let [knee, shin] = shapes.calf_ends.map(|end| (calf, end, shapes.calf_radius));
+            let motors = (hip, shapes.hip_centre(Leg::ALL[leg]), shapes.hip_radius);
+            [motors, knee, shin, (calf, shapes.foot_centre, shapes.foot_radius)]
+                .map(|(body, centre, radius)| (body.transform(centre.as_vec3()), radius as f32))
         });
         let lift = trunk
-            .into_iter()
             .chain(legs)
             .map(|(point, radius)| ground.clearance_height(point.x, point.y, radius) - point.z)
             .fold(f32::NEG_INFINITY, f32::max);

@@ -220,6 +220,10 @@ fn trunk(xml: &mut Xml, robot: &RobotModel, moves: bool, height: f64) {
     for leg in Leg::ALL {
         for kind in JointKind::ALL {
             link(xml, robot, Joint { leg, kind });
+            if kind == JointKind::Hip {
+                let shapes = &robot.shapes;
+                sphere(xml, leg, "motors", shapes.hip_centre(leg), shapes.hip_radius);
+            }
         }
         calf_geoms(xml, robot, leg);
         for _ in JointKind::ALL {
@@ -262,13 +266,14 @@ fn calf_geoms(xml: &mut Xml, robot: &RobotModel, leg: Leg) {
         ("knee", shapes.calf_ends[0], shapes.calf_radius),
     ];
     for (part, centre, radius) in spheres {
-        let name = format!("{}_{part}", leg.name());
-        let place = numbers(centre.to_array());
-        xml.leaf(
-            "geom",
-            &[("name", name), ("type", "sphere".to_owned()), ("pos", place), ("size", radius.to_string())],
-        );
+        sphere(xml, leg, part, centre, radius);
     }
+}
+
+fn sphere(xml: &mut Xml, leg: Leg, part: &str, centre: DVec3, radius: f64) {
+    let name = format!("{}_{part}", leg.name());
+    let place = numbers(centre.to_array());
+    xml.leaf("geom", &[("name", name), ("type", "sphere".to_owned()), ("pos", place), ("size", radius.to_string())]);
 }
 
 fn inertial(xml: &mut Xml, body: &RigidBody) {
@@ -392,8 +397,11 @@ mod tests {
         assert_eq!(values(&xml, "body", "name").len(), 1 + NUM_JOINTS);
         assert_eq!(values(&xml, "joint", "name"), crate::JOINT_NAMES);
         assert_eq!(values(&xml, "motor", "joint"), crate::JOINT_NAMES);
-        // Ground, trunk, three spheres per leg.
-        assert_eq!(values(&xml, "geom", "name").len(), 2 + 12);
+        assert_eq!(
+            values(&xml, "geom", "name").len(),
+            2 + 16,
+            "ground and trunk; hip, foot, shin and knee of each leg"
+        );
     }
 
     #[test]

@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 
-use crate::{Command, Joint, NUM_JOINTS, NUM_LEGS, PerJoint, RigidBody};
+use crate::{Command, Joint, Leg, NUM_JOINTS, NUM_LEGS, PerJoint, RigidBody};
 
 /// Robot with the kinematic tree of the Go2: a trunk and four legs of hip, thigh and calf.
 #[derive(Clone, Debug, PartialEq)]
@@ -228,6 +228,10 @@ impl ActuatorParams {
 pub struct Shapes {
     /// Half sizes of the trunk's box [m].
     pub trunk_half_size: DVec3,
+    /// Centre of the sphere that stands for the motors of a left hip, in its frame; that of a right hip is its mirror image [m].
+    pub hip_centre: DVec3,
+    /// Radius of this sphere [m].
+    pub hip_radius: f64,
     /// Half sizes of a thigh's box [m].
     pub thigh_half_size: DVec3,
     /// Centre of a thigh's box [m].
@@ -240,6 +244,13 @@ pub struct Shapes {
     pub foot_radius: f64,
     /// Centre of a foot's sphere in the calf's frame [m].
     pub foot_centre: DVec3,
+}
+
+impl Shapes {
+    /// Returns the centre of the sphere of a hip's motors in its frame [m].
+    pub fn hip_centre(&self, leg: Leg) -> DVec3 {
+        self.hip_centre * DVec3::new(1.0, leg.left_sign(), 1.0)
+    }
 }
 
 /// Contact with the ground: spring and damper at the effective mass of the contact, and Coulomb friction.

@@ -139,7 +139,7 @@ fn tree_shape(shape: &TreeShape) -> Option<SceneShape> {
 fn shapes(robot: &RobotModel) -> Vec<SceneShape> {
     let collision = &robot.shapes;
     let foot_radius = collision.foot_radius;
-    // Head and hip actuators are menagerie's collision geoms, which the simulators do not have.
+    // The head is menagerie's collision geom, which the simulators do not have; the motors of the hips are spheres there.
     let mut shapes = vec![
         cuboid(0, collision.trunk_half_size, DVec3::ZERO),
         capsule(0, 0.05, [DVec3::new(0.16, 0.0, 0.005), DVec3::new(0.285, 0.0, 0.01)]),

@@ -32,8 +32,12 @@ pub fn shapes(
     };
     let knee = tree.joints[found[2]].parent_from_child.translation;
     let thigh_radius = capsule(of(thigh)).map_or(calf_radius, |(_, radius)| radius);
+    let (hip_centre, hip_radius) =
+        hip(of(1 + found[0]), tree.joints[found[1]].parent_from_child.translation, thigh_radius);
     Ok(Shapes {
         trunk_half_size,
+        hip_centre,
+        hip_radius,
         thigh_half_size: DVec3::new(thigh_radius, thigh_radius, 0.5 * knee.z.abs()),
         thigh_centre: 0.5 * knee,
         calf_radius,
@@ -78,6 +82,18 @@ fn trunk_box<'a>(shapes: impl Iterator<Item = &'a TreeShape>, mounts: [DVec3; 4]
         ));
     }
     half
+}
+
+/// Returns centre and radius of the sphere of the front left hip: those of its thickest round shape, without one a sphere as thick as the
+/// thigh at its joint.
+fn hip<'a>(shapes: impl Iterator<Item = &'a TreeShape>, thigh_joint: DVec3, thigh_radius: f64) -> (DVec3, f64) {
+    let round = shapes.filter_map(|shape| match shape.kind {
+        TreeShapeKind::Sphere(radius)
+        | TreeShapeKind::Capsule { radius, .. }
+        | TreeShapeKind::Cylinder { radius, .. } => Some((shape.body_from_shape.translation, radius)),
+        _ => None,
+    });
+    round.max_by(|one, other| one.1.total_cmp(&other.1)).unwrap_or((thigh_joint, thigh_radius))
 }
 
 /// Returns centre and radius of the front left foot.

@@ -8,8 +8,9 @@ use twinstep_agent::read_contract;
 use twinstep_effects::ControlTable;
 use twinstep_envs::{ControlledRobot, Gait, JumpConfig, Randomisation, TaskConfig, TrackConfig, WalkConfig};
 use twinstep_measures::{
-    AttitudeErrors, AttitudeFollowing, Condition, CourseWalking, Evaluation, GaitFollowing, JUMP_S, Jumping,
-    KindOfGround, Measure, MeasureError, Run, Tracking, Walking, check_spec, conditions, measure,
+    AttitudeErrors, AttitudeFollowing, Condition, CourseWalking, Evaluation, GETUP_S, GaitFollowing, GettingUp,
+    GettingUpTimes, JUMP_S, Jumping, KindOfGround, Measure, MeasureError, Run, Tracking, Walking, check_spec,
+    conditions, measure,
 };
 use twinstep_model::{EnvError, EnvSpec, ResetRequest, VecEnv};
 use twinstep_policy::{Policy, PolicyRunner};
@@ -64,6 +65,8 @@ pub enum PolicyEvaluation {
     Gaits(Vec<Row<ByGait>>),
     /// Following of an attitude.
     Attitudes(Vec<Row<AttitudeErrors>>),
+    /// Getting up.
+    GettingUp(Vec<Row<GettingUpTimes>>),
 }
 
 impl PolicyEvaluation {
@@ -80,6 +83,7 @@ impl PolicyEvaluation {
             Self::Jumping(rows) => measure_tables::jumps(robots, rows),
             Self::Gaits(rows) => measure_tables::gaits(robots, seconds, rows),
             Self::Attitudes(rows) => measure_tables::attitude(robots, seconds, rows),
+            Self::GettingUp(rows) => measure_tables::getup(robots, rows),
         }
     }
 }
@@ -149,6 +153,7 @@ pub fn evaluate_policy(options: &EvaluatePolicyOptions, observer: &Observer) -> 
         TaskConfig::Jump(trained) => PolicyEvaluation::Jumping(jumping(who, trained)?),
         TaskConfig::Gait(_) => PolicyEvaluation::Gaits(gaits(who)?),
         TaskConfig::Attitude(_) => PolicyEvaluation::Attitudes(attitudes(who)?),
+        TaskConfig::Getup(_) => PolicyEvaluation::GettingUp(getting_up(who)?),
         task => PolicyEvaluation::Walking(walking(who, task)?),
     })
 }
@@ -272,6 +277,18 @@ fn attitudes(who: Who) -> Result<Vec<Row<AttitudeErrors>>, Failure> {
     let tasks = |_: &Condition| vec![(TaskConfig::Attitude(AttitudeFollowing::task()), ())];
     let new = |spec: &EnvSpec, _, (): &()| AttitudeFollowing::new(spec);
     Ok(mapped(measured(who, &who.0.wanted(), &tasks, run_of(who.0), new)?, |mut found| found.remove(0)))
+}
+
+/// Evaluates how fast the policy gets up under each condition.
+fn getting_up(who: Who) -> Result<Vec<Row<GettingUpTimes>>, Failure> {
+    let options = who.0;
+    let robot = TrainConfig { model: options.model.clone(), ..TrainConfig::default() }.robots(1)?.control();
+    let tasks = |_: &Condition| vec![(TaskConfig::Getup(GettingUp::task()), ())];
+    let new = |spec: &EnvSpec, robots: usize, (): &()| {
+        GettingUp::new(spec, robots, robot.standing_height.expect("a quadruped stands"))
+    };
+    let run = Run { seconds: GETUP_S, ..run_of(options) };
+    Ok(mapped(measured(who, &options.wanted(), &tasks, run, new)?, |mut found| found.remove(0)))
 }
 
 /// Evaluates the landings of the policy under each condition.

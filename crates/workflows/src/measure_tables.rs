@@ -4,8 +4,8 @@ use std::fmt::Write;
 
 use serde::Serialize;
 use twinstep_measures::{
-    AttitudeErrors, Evaluation, GaitMotion, JUMP_S, KindOfGround, Landings, Level, PoseErrors, SpeedBin, Tracking,
-    TrackingErrors,
+    AttitudeErrors, Evaluation, GETUP_S, GaitMotion, GettingUpTimes, JUMP_S, KindOfGround, Landings, Level, PoseErrors,
+    SpeedBin, Tracking, TrackingErrors,
 };
 use twinstep_sim::{Engine, PatchKind};
 
@@ -169,6 +169,25 @@ pub fn attitude(robots: u32, seconds: f64, rows: &[Row<AttitudeErrors>]) -> Stri
             text,
             "{condition:10} {engine:8} {:5.1} %  {l_attitude:.4}      {roll_rms:.4}     {pitch_rms:.4}     {height_rms:.4} m",
             100.0 * up
+        );
+    }
+    text
+}
+
+/// Returns the times as a table.
+pub fn getup(robots: u32, rows: &[Row<GettingUpTimes>]) -> String {
+    let mut text = format!(
+        "{robots} robots dropped in any orientation and pose, {GETUP_S} s\n\n\
+         condition  engine   within 3 s  at the end  median  longest\n"
+    );
+    for Row { condition, engine, found } in rows {
+        let engine = name(*engine);
+        let GettingUpTimes { within_3_s, at_end, median_s, longest_s } = found;
+        let _ = writeln!(
+            text,
+            "{condition:10} {engine:8}    {:5.1} %     {:5.1} %  {median_s:.2} s   {longest_s:.2} s",
+            100.0 * within_3_s,
+            100.0 * at_end
         );
     }
     text

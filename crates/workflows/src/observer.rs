@@ -4,7 +4,7 @@ use std::fmt::Display;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use indicatif::{ProgressBar, ProgressDrawTarget};
 
 use crate::failure::Failure;
 use crate::progress_lines;
@@ -61,6 +61,6 @@ impl Observer {
 
     fn styled(&self, bar: ProgressBar, template: &str) -> ProgressBar {
         bar.set_draw_target(if self.is_silent { ProgressDrawTarget::hidden() } else { progress_lines::target() });
-        bar.with_style(ProgressStyle::with_template(template).expect("the template is valid"))
+        bar.with_style(progress_lines::style(template))
     }
 }

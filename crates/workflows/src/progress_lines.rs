@@ -1,10 +1,10 @@
-//! Progress where stderr is no terminal: lines that stay, more rarely the longer the work lasts.
+//! How progress is shown on stderr. Where it is no terminal: lines that stay, more rarely the longer the work lasts.
 
 use std::io::{IsTerminal, Write, stderr};
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
-use indicatif::{ProgressDrawTarget, TermLike};
+use indicatif::{HumanCount, ProgressDrawTarget, ProgressState, ProgressStyle, TermLike};
 
 /// Columns of a line.
 const WIDTH: u16 = 120;
@@ -19,6 +19,23 @@ pub fn target() -> ProgressDrawTarget {
         ProgressDrawTarget::stderr()
     } else {
         ProgressDrawTarget::term_like(Box::new(Lines::default()))
+    }
+}
+
+/// Returns the style of a template of `indicatif`, whose `per_sec` is a whole number above 10.
+pub fn style(template: &str) -> ProgressStyle {
+    let per_sec = |state: &ProgressState, out: &mut dyn std::fmt::Write| {
+        // The text is empty if it cannot be written.
+        let _ = out.write_str(&rate(state.per_sec()));
+    };
+    ProgressStyle::with_template(template).expect("the template is valid").with_key("per_sec", per_sec)
+}
+
+fn rate(per_second: f64) -> String {
+    if per_second < 10.0 {
+        format!("{per_second:.2}/s")
+    } else {
+        format!("{}/s", HumanCount(per_second.round() as u64))
     }
 }
 
@@ -94,6 +111,11 @@ impl TermLike for Lines {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn rates_are_whole_numbers_above_ten() {
+        assert_eq!([0.0417, 9.2, 62_512.9562].map(rate), ["0.04/s", "9.20/s", "62,513/s"]);
+    }
 
     #[test]
     fn lines_are_a_second_apart_and_rarer_later() {

@@ -24,6 +24,9 @@ const TRAINING_PHYSICS_HZ: u32 = 400;
 /// Settings of a training on rough ground, slopes and stairs.
 const TERRAIN: &str = include_str!("../../../data/policies/walk_terrain.toml");
 
+/// Settings of a training to get up.
+const GETUP: &str = include_str!("../../../data/policies/getup.toml");
+
 /// Config file of a training (TOML). Every key is optional.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -73,6 +76,15 @@ impl TrainConfig {
     /// Returns the settings of a walk on rough ground, slopes and stairs: those of `data/policies/walk_terrain.toml`.
     pub fn terrain() -> Self {
         parse_toml(TERRAIN).expect("settings of this program are valid")
+    }
+
+    /// Returns the settings of a task without a config file: those of `data/policies/getup.toml` for `getup`, and the defaults for the
+    /// others. `None` if there is no such task.
+    pub fn of_task(name: &str) -> Option<Self> {
+        match name {
+            "getup" => Some(parse_toml(GETUP).expect("settings of this program are valid")),
+            _ => Some(Self { task: TaskConfig::named(name)?, ..Self::default() }),
+        }
     }
 
     /// Returns true if the robots are simulated as a tree.
@@ -136,6 +148,18 @@ pub fn scene_info(robots: &AnyEnvFactory, title: impl Into<String>, scene: &Scen
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn settings_of_this_program_are_valid_and_those_of_a_task_are_for_it() {
+        TrainConfig::terrain().train.check().expect("valid");
+        for name in TaskConfig::NAMES {
+            let config = TrainConfig::of_task(name).expect("a task");
+            assert_eq!(config.task.name(), name);
+            assert_eq!(config.sim.physics_hz, Some(TRAINING_PHYSICS_HZ), "{name}");
+            config.train.check().expect("valid");
+        }
+        assert!(TrainConfig::of_task("fly").is_none());
+    }
 
     #[test]
     fn one_key_of_the_simulation_leaves_the_physics_rate_of_a_training() {

@@ -2,8 +2,8 @@
 
 use twinstep_envs::{JumpConfig, TaskConfig, WalkConfig};
 use twinstep_measures::{
-    AttitudeErrors, AttitudeFollowing, Evaluation, JUMP_S, Jumping, Landings, Measure, MeasureError, PoseErrors,
-    PoseFollowing, Run, Walking, measure,
+    AttitudeErrors, AttitudeFollowing, Evaluation, GETUP_S, GettingUp, GettingUpTimes, JUMP_S, Jumping, Landings,
+    Measure, MeasureError, PoseErrors, PoseFollowing, Run, Walking, measure,
 };
 use twinstep_model::{EnvSpec, VecEnv};
 use twinstep_policy::Policy;
@@ -22,8 +22,8 @@ const RUN: Run = Run { seconds: 20.0, seed: 1_000_000 };
 /// Evaluates `policy`, which was trained with `config` on the robots of these servers, or in this process if there are
 /// none. Returns the evaluation as JSON and as a table.
 ///
-/// The robots are fresh ones of the server, or of the training's model with default commands and physics. Jumps and the
-/// attitude are evaluated in this process only.
+/// The robots are fresh ones of the server, or of the training's model with default commands and physics. Jumps, the
+/// attitude and getting up are evaluated in this process only.
 pub fn evaluate_trained(
     policy: &Policy,
     config: &TrainConfig,
@@ -45,6 +45,11 @@ pub fn evaluate_trained(
         let errors = attitude(policy, config, observer)?;
         let rows = [nominal(errors)];
         let table = measure_tables::attitude(ROBOTS as u32, RUN.seconds, &rows);
+        return Ok((json(serde_json::to_string_pretty(&rows[0].found)), text(table)));
+    }
+    if let TaskConfig::Getup(_) = &config.task {
+        let rows = [nominal(getup(policy, config, observer)?)];
+        let table = measure_tables::getup(ROBOTS as u32, &rows);
         return Ok((json(serde_json::to_string_pretty(&rows[0].found)), text(table)));
     }
     if let TaskConfig::Pose(_) = &config.task {
@@ -123,6 +128,13 @@ fn jumps(
 fn attitude(policy: &Policy, config: &TrainConfig, observer: &Observer) -> Result<AttitudeErrors, Failure> {
     let fresh = fresh(config, TaskConfig::Attitude(AttitudeFollowing::task()));
     measured(policy, &fresh, RUN, observer, |spec, _| AttitudeFollowing::new(spec))
+}
+
+fn getup(policy: &Policy, config: &TrainConfig, observer: &Observer) -> Result<GettingUpTimes, Failure> {
+    let fresh = fresh(config, TaskConfig::Getup(GettingUp::task()));
+    let standing_height = fresh.robots(1)?.control().standing_height.expect("a quadruped stands");
+    let run = Run { seconds: GETUP_S, ..RUN };
+    measured(policy, &fresh, run, observer, |spec, robots| GettingUp::new(spec, robots, standing_height))
 }
 
 fn pose(policy: &Policy, config: &TrainConfig, observer: &Observer) -> Result<PoseErrors, Failure> {

@@ -12,6 +12,8 @@ pub mod gait;
 pub mod gait_clock;
 pub mod gait_config;
 pub mod gait_reward;
+pub mod getup;
+pub mod getup_config;
 pub mod jump;
 pub mod jump_config;
 pub mod jump_flight;
@@ -29,6 +31,8 @@ pub use explore_config::ExploreConfig;
 pub use gait::GaitTask;
 pub use gait_clock::Gait;
 pub use gait_config::GaitConfig;
+pub use getup::Getup;
+pub use getup_config::GetupConfig;
 pub use jump::Jump;
 pub use jump_config::JumpConfig;
 pub use pose::{PoseState, PoseTask};
@@ -54,6 +58,8 @@ pub enum TaskConfig {
     Attitude(AttitudeConfig),
     /// A residual on a frozen policy of `walk`, rewarded for the uncertainty of the actuator networks.
     Explore(ExploreConfig),
+    /// Getting up from any orientation and pose.
+    Getup(GetupConfig),
     /// The joints of any robot follow targets.
     Pose(PoseConfig),
     /// Counts steps without physics, to verify and measure the transport. It has no settings.
@@ -68,7 +74,7 @@ impl Default for TaskConfig {
 
 impl TaskConfig {
     /// Names of all tasks.
-    pub const NAMES: [&str; 8] = ["walk", "track", "jump", "gait", "attitude", "explore", "pose", "counter"];
+    pub const NAMES: [&str; 9] = ["walk", "track", "jump", "gait", "attitude", "explore", "getup", "pose", "counter"];
 
     /// Returns the task of this name with default settings. Returns `None` if there is no such task.
     pub fn named(name: &str) -> Option<Self> {
@@ -79,6 +85,7 @@ impl TaskConfig {
             "gait" => Some(Self::Gait(GaitConfig::default())),
             "attitude" => Some(Self::Attitude(AttitudeConfig::default())),
             "explore" => Some(Self::Explore(ExploreConfig::default())),
+            "getup" => Some(Self::Getup(GetupConfig::default())),
             "pose" => Some(Self::Pose(PoseConfig::default())),
             "counter" => Some(Self::Counter),
             _ => None,
@@ -94,6 +101,7 @@ impl TaskConfig {
             Self::Gait(_) => "gait",
             Self::Attitude(_) => "attitude",
             Self::Explore(_) => "explore",
+            Self::Getup(_) => "getup",
             Self::Pose(_) => "pose",
             Self::Counter => "counter",
         }
@@ -108,6 +116,7 @@ impl TaskConfig {
             Self::Gait(config) => config.check(),
             Self::Attitude(config) => config.check(),
             Self::Explore(config) => config.check(),
+            Self::Getup(config) => config.check(),
             Self::Pose(config) => config.check(),
             Self::Counter => Ok(()),
         }
@@ -147,8 +156,13 @@ impl TaskConfig {
                 ("task.walk.reward.epistemic_uncertainty", config.walk.reward.epistemic_uncertainty)
             }
             Self::Explore(config) => ("task.uncertainty_weight", config.uncertainty_weight),
-            Self::Pose(_) | Self::Counter => ("task", 0.0),
+            Self::Getup(_) | Self::Pose(_) | Self::Counter => ("task", 0.0),
         }
+    }
+
+    /// Returns the joint offset of an action of 1, if the task needs another one than the robot has [rad].
+    pub fn action_scale(&self) -> Option<f64> {
+        matches!(self, Self::Getup(_)).then_some(getup::ACTION_SCALE)
     }
 }
 
@@ -164,6 +178,7 @@ impl TryFrom<toml::Table> for TaskConfig {
             Some("gait") => over_defaults(&GaitConfig::default(), table).map(Self::Gait),
             Some("attitude") => over_defaults(&AttitudeConfig::default(), table).map(Self::Attitude),
             Some("explore") => over_defaults(&ExploreConfig::default(), table).map(Self::Explore),
+            Some("getup") => over_defaults(&GetupConfig::default(), table).map(Self::Getup),
             Some("pose") => over_defaults(&PoseConfig::default(), table).map(Self::Pose),
             Some("counter") if table.is_empty() => Ok(Self::Counter),
             Some("counter") => Err("the task `counter` has no settings besides `name`".to_owned()),
@@ -188,7 +203,7 @@ mod tests {
         let common = WalkConfig { tracking_sigma: 0.5, ..WalkConfig::default() };
         assert_eq!(track, TaskConfig::Track(TrackConfig { walk: common, ..config }));
         assert_eq!(parse("name = \"counter\"").expect("valid"), TaskConfig::Counter);
-        let others = ["jump", "gait", "pose"].map(|name| TaskConfig::named(name).expect("a task"));
+        let others = ["jump", "gait", "getup", "pose"].map(|name| TaskConfig::named(name).expect("a task"));
         for task in [walk, track, TaskConfig::Counter].into_iter().chain(others) {
             assert_eq!(parse(&toml::to_string(&task).expect("serialised")).expect("valid"), task);
         }
@@ -218,7 +233,7 @@ mod tests {
             in `reward`
         "#]].assert_eq(&error("[reward]\ntorques = -1.0"));
         expect![[r#"
-            `name` = "fly" is not a task; possible: walk, track, jump, gait, attitude, explore, pose, counter
+            `name` = "fly" is not a task; possible: walk, track, jump, gait, attitude, explore, getup, pose, counter
         "#]]
         .assert_eq(&error("name = \"fly\""));
         expect![[r#"

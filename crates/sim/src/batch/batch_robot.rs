@@ -1,7 +1,7 @@
 //! What the batch engine needs of a robot, beside its equations of motion.
 
 use glam::{DVec3, dvec3};
-use twinstep_model::{BaseMount, Contact, JointModel, RobotModel, TreeModel};
+use twinstep_model::{BaseMount, Contact, JointModel, Leg, RobotModel, TreeModel};
 
 /// Number of contact points of a leg: the foot, the distal end of the calf, the knee.
 const LEG_POINTS: usize = 3;
@@ -56,7 +56,7 @@ impl BatchRobot for RobotModel {
         self.gyro_bias
     }
 
-    /// Returns foot, distal end of the calf and knee of each leg, then the corners of the trunk.
+    /// Returns foot, distal end of the calf and knee of each leg, then the corners of the trunk, then the hips.
     fn surface_points(&self) -> Vec<SurfacePoint> {
         let shapes = &self.shapes;
         let [knee, shin] = shapes.calf_ends;
@@ -68,7 +68,12 @@ impl BatchRobot for RobotModel {
             let centre = shapes.trunk_half_size * dvec3(sign(0), sign(1), sign(2));
             SurfacePoint { body: 0, centre, radius: 0.0 }
         });
-        legs.chain(corners).collect()
+        let hips = Leg::ALL.map(|leg| SurfacePoint {
+            body: 3 * leg as usize + 1,
+            centre: shapes.hip_centre(leg),
+            radius: shapes.hip_radius,
+        });
+        legs.chain(corners).chain(hips).collect()
     }
 }
 
@@ -77,7 +82,7 @@ pub fn foot_point(leg: usize) -> usize {
     leg * LEG_POINTS
 }
 
-/// Returns true if a surface point of a quadruped is a knee or a corner of the trunk.
+/// Returns true if a surface point of a quadruped is a knee, a hip or a corner of the trunk.
 pub fn is_upper_body(point: usize) -> bool {
     point >= FIRST_CORNER || point % LEG_POINTS == LEG_POINTS - 1
 }

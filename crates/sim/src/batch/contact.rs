@@ -12,8 +12,11 @@ use super::ground::TangentPlane;
 use super::rows::{ConstraintRow, PointRow, SoftConstraint, complete_friction, write_base_row, write_joint_row};
 use super::surface::{ContactParams, PointsOfBody, SimdPoint};
 
-/// Number of points of a body from which on it is worth while to test first whether all are far from the ground.
-const MANY_POINTS: usize = 5;
+/// Returns true if it is worth while to test first whether all points of a body are far from the ground: there are many, or it is
+/// one, such as a hip, for which this test is cheaper than that of a contact with a height field.
+fn tests_all_first(points: usize) -> bool {
+    points == 1 || points >= 5
+}
 
 /// Impulses of the last step, the initial guess of the next one.
 #[derive(Clone, Debug)]
@@ -175,7 +178,7 @@ impl<T: SimdFloat, B: JointValues<T>> Constraints<T, B> {
         let zero = T::splat(0.0);
         let (ground, each) = (step.surface.ground.local_ground(step.state), step.surface.ground.contacts_of_point());
         for PointsOfBody { body, points, centre, radius } in &step.surface.bodies {
-            if points.len() >= MANY_POINTS {
+            if tests_all_first(points.len()) {
                 let lowest = ground.lowest_within(step.equations.point(*body, *centre), *radius);
                 if !lowest.any_lt(zero) {
                     impulses.points[each * points.start..each * points.end].fill([zero; 3]);

@@ -250,7 +250,7 @@ impl Simulator for MujocoBackend {
 /// Returns joints and geoms of a quadruped: its feet, then what is not to touch the ground. A knee is the lower end of a thigh.
 fn layout() -> Layout {
     let names = |end: &str| Leg::ALL.map(|leg| format!("{}_{end}", leg.name()));
-    let geoms = names("foot").into_iter().chain(["trunk".to_owned()]).chain(names("knee"));
+    let geoms = names("foot").into_iter().chain(["trunk".to_owned()]).chain(names("knee")).chain(names("motors"));
     Layout { joints: JOINT_NAMES.map(str::to_owned).to_vec(), geoms: geoms.collect(), base: 1 }
 }
 

@@ -3,7 +3,8 @@
 use glam::{DAffine3, DQuat, DVec3};
 use rapier3d::prelude::*;
 use twinstep_model::{
-    Contact, JointModel, RigidBody, RobotModel, RobotTree, TreeJointKind, TreeModel, TreeShape, TreeShapeKind,
+    Contact, JointModel, Leg, RigidBody, RobotModel, RobotTree, Shapes, TreeJointKind, TreeModel, TreeShape,
+    TreeShapeKind,
 };
 
 /// Robot whose frames are parallel at position 0 of all joints.
@@ -59,12 +60,17 @@ impl WorldRobot {
         }
     }
 
-    /// Returns a quadruped. Its shapes are the trunk, then thigh, calf and foot of each leg.
+    /// Returns a quadruped. Its shapes are the trunk, then hip, thigh, calf and foot of each leg.
     pub fn of_quadruped(robot: &RobotModel) -> Self {
         let tree = RobotTree::from(robot);
         let body = |leg: usize, kind: usize| 1 + 3 * leg + kind;
         let of_leg = (0..4).flat_map(|leg| {
-            [(body(leg, 1), thigh_box(robot)), (body(leg, 2), calf_capsule(robot)), (body(leg, 2), foot_sphere(robot))]
+            [
+                (body(leg, 0), hip_sphere(robot, Leg::ALL[leg])),
+                (body(leg, 1), thigh_box(robot)),
+                (body(leg, 2), calf_capsule(robot)),
+                (body(leg, 2), foot_sphere(robot)),
+            ]
         });
         Self {
             base: robot.trunk,
@@ -81,12 +87,12 @@ impl WorldRobot {
 
 /// Returns the index of the foot of a leg among the shapes of a quadruped.
 pub fn foot_shape(leg: usize) -> usize {
-    3 + 3 * leg
+    4 + 4 * leg
 }
 
-/// Returns true if a shape of a quadruped is the trunk or a thigh.
+/// Returns true if a shape of a quadruped is the trunk, a hip or a thigh.
 pub fn is_upper_body(shape: usize) -> bool {
-    shape == 0 || shape % 3 == 1
+    shape == 0 || matches!(shape % 4, 1 | 2)
 }
 
 fn links(tree: &RobotTree) -> Vec<WorldLink> {
@@ -118,6 +124,11 @@ fn collider(shape: &TreeShape) -> Option<ColliderBuilder> {
 fn trunk_box(robot: &RobotModel) -> ColliderBuilder {
     let half = robot.shapes.trunk_half_size.as_vec3();
     ColliderBuilder::cuboid(half.x, half.y, half.z)
+}
+
+fn hip_sphere(robot: &RobotModel, leg: Leg) -> ColliderBuilder {
+    let Shapes { hip_radius, .. } = robot.shapes;
+    ColliderBuilder::ball(hip_radius as f32).translation(robot.shapes.hip_centre(leg).as_vec3())
 }
 
 fn thigh_box(robot: &RobotModel) -> ColliderBuilder {
