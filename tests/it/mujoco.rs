@@ -362,7 +362,7 @@ fn output_that_is_no_reply_is_an_error() {
         it is another version: it wrote "abcd", not `twinstep-mujoco 3`
         it wrote a frame of kind 'D' with 1 bytes as a reply
         it ended (exit status: 0); its messages are on stderr
-        the process of engine `mujoco` failed: it wrote the states of its robots in 1 bytes; 244 are expected; its robots are lost, create them again"#]].assert_eq(&reasons.join("\n"));
+        the process of engine `mujoco` failed: it wrote the states of its robots in 1 bytes; 260 are expected; its robots are lost, create them again"#]].assert_eq(&reasons.join("\n"));
 }
 
 #[test]

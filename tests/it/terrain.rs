@@ -95,6 +95,26 @@ fn stands_on_its_feet<B: Simulator>(make: Make<B>, terrain: fn(u64) -> Terrain) 
 }
 
 #[test]
+fn robot_on_its_side_lies_on_its_hips_in_both_engines() {
+    // Its hips reach 17.25 cm to the side; its thighs and knees 15.4 cm.
+    for height in [height_on_the_side(rapier), height_on_the_side(batch)] {
+        assert!((0.165..0.175).contains(&height), "{height} m");
+    }
+}
+
+/// Returns the height of the base of a robot that was dropped on its right side from 1 cm [m].
+fn height_on_the_side<B: Simulator>(make: Make<B>) -> f32 {
+    let mut backend = make(SimConfig { threads: 1, ..SimConfig::default() });
+    let mut q = go2().control.default_pose_f32();
+    [0, 3, 6, 9].map(|hip| q[hip] = 0.0);
+    let turned = Quat::from_rotation_x(std::f32::consts::FRAC_PI_2);
+    let lies = InitialState::turned_at(&Ground::FLAT, backend.robot(), q, 0.01, [0.0; 3], turned);
+    backend.reset(&[(0, lies)]).unwrap();
+    backend.step(&[Command::hold(q, 60.0, 2.0)], &[true], 400).unwrap();
+    backend.states().truth.base_position[0][2]
+}
+
+#[test]
 fn foot_forces_on_gentle_terrain_equal_the_weight() {
     check_foot_forces(rapier);
     check_foot_forces(batch);

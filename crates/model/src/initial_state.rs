@@ -2,7 +2,7 @@
 
 use glam::{Quat, Vec3};
 
-use crate::{Ground, Leg, NUM_JOINTS, PerJoint, Pose, RobotModel, body_poses, frames};
+use crate::{Ground, NUM_JOINTS, PerJoint, Pose, RobotModel, body_poses, frames};
 
 /// State to which a robot is reset.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -70,7 +70,7 @@ impl InitialState {
         let legs = (0..4).flat_map(|leg| {
             let (hip, calf) = (poses[1 + 3 * leg], poses[3 + 3 * leg]);
             let [knee, shin] = shapes.calf_ends.map(|end| (calf, end, shapes.calf_radius));
-            let motors = (hip, shapes.hip_centre(Leg::ALL[leg]), shapes.hip_radius);
+            let motors = (hip, robot.hip_centre(leg), shapes.hip_radius);
             [motors, knee, shin, (calf, shapes.foot_centre, shapes.foot_radius)]
                 .map(|(body, centre, radius)| (body.transform(centre.as_vec3()), radius as f32))
         });

@@ -220,10 +220,6 @@ fn trunk(xml: &mut Xml, robot: &RobotModel, moves: bool, height: f64) {
     for leg in Leg::ALL {
         for kind in JointKind::ALL {
             link(xml, robot, Joint { leg, kind });
-            if kind == JointKind::Hip {
-                let shapes = &robot.shapes;
-                sphere(xml, leg, "motors", shapes.hip_centre(leg), shapes.hip_radius);
-            }
         }
         calf_geoms(xml, robot, leg);
         for _ in JointKind::ALL {
@@ -239,6 +235,9 @@ fn link(xml: &mut Xml, robot: &RobotModel, joint: Joint) {
     let origin = leg.origins[joint.kind as usize];
     xml.open("body", &[("name", joint.name().to_owned()), ("pos", numbers(origin.to_array()))]);
     inertial(xml, &leg.bodies[joint.kind as usize]);
+    if joint.kind as usize == 0 {
+        sphere(xml, joint.leg, "motors", robot.hip_centre(joint.leg as usize), robot.shapes.hip_radius);
+    }
     let has_limits = numbers_of.range.iter().all(|limit| limit.is_finite());
     let mut attributes = vec![
         ("name", joint.name().to_owned()),

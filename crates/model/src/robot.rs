@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 
-use crate::{Command, Joint, Leg, NUM_JOINTS, NUM_LEGS, PerJoint, RigidBody};
+use crate::{Command, Joint, NUM_JOINTS, NUM_LEGS, PerJoint, RigidBody};
 
 /// Robot with the kinematic tree of the Go2: a trunk and four legs of hip, thigh and calf.
 #[derive(Clone, Debug, PartialEq)]
@@ -54,6 +54,12 @@ impl Derating {
 }
 
 impl RobotModel {
+    /// Returns the centre of the sphere of a hip's motors in its frame, on the side of its leg [m].
+    pub fn hip_centre(&self, leg: usize) -> DVec3 {
+        let side = self.legs[leg].origins[1].y.signum();
+        self.shapes.hip_centre * DVec3::new(1.0, side, 1.0)
+    }
+
     /// Returns the mass of the whole robot [kg].
     pub fn total_mass(&self) -> f64 {
         self.trunk.mass + self.legs.iter().flat_map(|leg| &leg.bodies).map(|body| body.mass).sum::<f64>()
@@ -244,13 +250,6 @@ pub struct Shapes {
     pub foot_radius: f64,
     /// Centre of a foot's sphere in the calf's frame [m].
     pub foot_centre: DVec3,
-}
-
-impl Shapes {
-    /// Returns the centre of the sphere of a hip's motors in its frame [m].
-    pub fn hip_centre(&self, leg: Leg) -> DVec3 {
-        self.hip_centre * DVec3::new(1.0, leg.left_sign(), 1.0)
-    }
 }
 
 /// Contact with the ground: spring and damper at the effective mass of the contact, and Coulomb friction.

@@ -113,8 +113,16 @@ __all__ = [
     "stop_robot",
 ]
 
-# With the number of policy steps of an episode: 20 s, a jump 3 s.
-_MAX_EPISODE_STEPS = {"walk": 1000, "track": 1000, "jump": 150, "gait": 1000, "attitude": 1000, "explore": 1000, "getup": 250}
+# With the number of policy steps of an episode: 20 s, a jump 3 s, getting up 5 s.
+_MAX_EPISODE_STEPS = {
+    "walk": 1000,
+    "track": 1000,
+    "jump": 150,
+    "gait": 1000,
+    "attitude": 1000,
+    "explore": 1000,
+    "getup": 250,
+}
 for _task, _max_episode_steps in _MAX_EPISODE_STEPS.items():
     gymnasium.register(
         id=f"twinstep/Go2-{_task.capitalize()}-v0",

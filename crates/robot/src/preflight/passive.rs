@@ -219,7 +219,9 @@ impl Observation {
             let remedy = "keep the robot at rest while it starts; check the gyroscope's unit";
             findings.push(Finding::new("gyro_bias", "the gyroscope has a bias".to_owned(), evidence, remedy));
         }
-        findings.extend(accelerometer(acc));
+        // The mean of a robot that turns is shorter by as much as that of its upward direction.
+        let up_length = mean(&self.samples, Sample::up).length();
+        findings.extend(accelerometer(acc, GRAVITY * up_length));
         findings.extend(self.orientation(acc, config));
         findings
     }
@@ -305,10 +307,11 @@ pub(super) fn inverse(evidence: String) -> Finding {
     Finding::new("quaternion_inverted", what, evidence, remedy).blocking(Blocks::Stance)
 }
 
-fn accelerometer(acc: Vec3) -> Option<Finding> {
+/// Compares the mean of the accelerometer with the expected length [m/s²].
+fn accelerometer(acc: Vec3, expected: f32) -> Option<Finding> {
     let length = acc.length();
-    let evidence = format!("the mean at rest is {length:.2}; gravity is {GRAVITY} m/s²");
-    if (length - GRAVITY).abs() <= MAX_ACC_ERROR {
+    let evidence = format!("the mean is {length:.2} in place of {expected:.2} m/s²");
+    if (length - expected).abs() <= MAX_ACC_ERROR {
         None
     } else if (length - 1.0).abs() < MAX_ACC_ERROR / GRAVITY {
         let remedy = "multiply the readings by 9.81";

@@ -1,7 +1,7 @@
 //! What the batch engine needs of a robot, beside its equations of motion.
 
 use glam::{DVec3, dvec3};
-use twinstep_model::{BaseMount, Contact, JointModel, Leg, RobotModel, TreeModel};
+use twinstep_model::{BaseMount, Contact, JointModel, RobotModel, TreeModel};
 
 /// Number of contact points of a leg: the foot, the distal end of the calf, the knee.
 const LEG_POINTS: usize = 3;
@@ -68,9 +68,9 @@ impl BatchRobot for RobotModel {
             let centre = shapes.trunk_half_size * dvec3(sign(0), sign(1), sign(2));
             SurfacePoint { body: 0, centre, radius: 0.0 }
         });
-        let hips = Leg::ALL.map(|leg| SurfacePoint {
-            body: 3 * leg as usize + 1,
-            centre: shapes.hip_centre(leg),
+        let hips = (0..4).map(|leg| SurfacePoint {
+            body: 3 * leg + 1,
+            centre: self.hip_centre(leg),
             radius: shapes.hip_radius,
         });
         legs.chain(corners).chain(hips).collect()

@@ -3,8 +3,7 @@
 use glam::{DAffine3, DQuat, DVec3};
 use rapier3d::prelude::*;
 use twinstep_model::{
-    Contact, JointModel, Leg, RigidBody, RobotModel, RobotTree, Shapes, TreeJointKind, TreeModel, TreeShape,
-    TreeShapeKind,
+    Contact, JointModel, RigidBody, RobotModel, RobotTree, TreeJointKind, TreeModel, TreeShape, TreeShapeKind,
 };
 
 /// Robot whose frames are parallel at position 0 of all joints.
@@ -66,7 +65,7 @@ impl WorldRobot {
         let body = |leg: usize, kind: usize| 1 + 3 * leg + kind;
         let of_leg = (0..4).flat_map(|leg| {
             [
-                (body(leg, 0), hip_sphere(robot, Leg::ALL[leg])),
+                (body(leg, 0), hip_sphere(robot, leg)),
                 (body(leg, 1), thigh_box(robot)),
                 (body(leg, 2), calf_capsule(robot)),
                 (body(leg, 2), foot_sphere(robot)),
@@ -126,9 +125,8 @@ fn trunk_box(robot: &RobotModel) -> ColliderBuilder {
     ColliderBuilder::cuboid(half.x, half.y, half.z)
 }
 
-fn hip_sphere(robot: &RobotModel, leg: Leg) -> ColliderBuilder {
-    let Shapes { hip_radius, .. } = robot.shapes;
-    ColliderBuilder::ball(hip_radius as f32).translation(robot.shapes.hip_centre(leg).as_vec3())
+fn hip_sphere(robot: &RobotModel, leg: usize) -> ColliderBuilder {
+    ColliderBuilder::ball(robot.shapes.hip_radius as f32).translation(robot.hip_centre(leg).as_vec3())
 }
 
 fn thigh_box(robot: &RobotModel) -> ColliderBuilder {
