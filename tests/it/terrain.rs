@@ -106,7 +106,9 @@ fn robot_on_its_side_lies_on_its_hips_in_both_engines() {
 fn height_on_the_side<B: Simulator>(make: Make<B>) -> f32 {
     let mut backend = make(SimConfig { threads: 1, ..SimConfig::default() });
     let mut q = go2().control.default_pose_f32();
-    [0, 3, 6, 9].map(|hip| q[hip] = 0.0);
+    for hip in [0, 3, 6, 9] {
+        q[hip] = 0.0;
+    }
     let turned = Quat::from_rotation_x(std::f32::consts::FRAC_PI_2);
     let lies = InitialState::turned_at(&Ground::FLAT, backend.robot(), q, 0.01, [0.0; 3], turned);
     backend.reset(&[(0, lies)]).unwrap();

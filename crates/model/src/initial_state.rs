@@ -42,16 +42,11 @@ impl InitialState {
     /// The collision point with the least distance to the ground is `clearance` [m] above it. The points are the feet,
     /// the knees, the calf ends, the hips and the corners of the trunk.
     pub fn standing_on(ground: &Ground, robot: &RobotModel, q: PerJoint, clearance: f32) -> Self {
-        Self::standing_at(ground, robot, q, clearance, [0.0; 3])
+        Self::turned_at(ground, robot, q, clearance, [0.0; 3], Quat::IDENTITY)
     }
 
     /// Returns the state as [`InitialState::standing_on`] does, above another point of the ground: x [m], y [m], and the yaw
-    /// of the robot [rad].
-    pub fn standing_at(ground: &Ground, robot: &RobotModel, q: PerJoint, clearance: f32, place: [f32; 3]) -> Self {
-        Self::turned_at(ground, robot, q, clearance, place, Quat::IDENTITY)
-    }
-
-    /// Returns the state as [`InitialState::standing_at`] does, with the base turned from there by a rotation in its own frame.
+    /// of the robot [rad]. The base is turned from there by a rotation in its own frame.
     pub fn turned_at(
         ground: &Ground,
         robot: &RobotModel,

@@ -114,7 +114,7 @@ mod tests {
 
     #[test]
     fn rates_are_whole_numbers_above_ten() {
-        assert_eq!([0.0417, 9.2, 62_512.9562].map(rate), ["0.04/s", "9.20/s", "62,513/s"]);
+        assert_eq!([0.0417, 9.2, 62_512.9].map(rate), ["0.04/s", "9.20/s", "62,513/s"]);
     }
 
     #[test]
