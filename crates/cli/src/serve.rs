@@ -42,8 +42,8 @@ pub struct Args {
     /// Name of the robot, by which clients find the server. Default: go2.
     #[arg(long)]
     name: Option<String>,
-    /// Task: walk, track, jump, gait, attitude, getup or explore for quadrupeds like the Go2; pose (its joints follow targets) for any
-    /// robot; counter (no physics, to measure the transport). Default: walk.
+    /// Task: walk, track, jump, gait, attitude, getup or explore for quadrupeds like the Go2; pose (its joints follow
+    /// targets) for any robot; counter (no physics, to measure the transport). Default: walk.
     #[arg(long, value_parser = task_name)]
     task: Option<&'static str>,
     /// Maximum number of environments of all clients together. Each client requests its number with its lease.

@@ -235,7 +235,8 @@ fn link(xml: &mut Xml, robot: &RobotModel, joint: Joint) {
     let origin = leg.origins[joint.kind as usize];
     xml.open("body", &[("name", joint.name().to_owned()), ("pos", numbers(origin.to_array()))]);
     inertial(xml, &leg.bodies[joint.kind as usize]);
-    if joint.kind as usize == 0 {
+    let is_hip = joint.kind as usize == 0;
+    if is_hip {
         sphere(xml, joint.leg, "motors", robot.hip_centre(joint.leg as usize), robot.shapes.hip_radius);
     }
     let has_limits = numbers_of.range.iter().all(|limit| limit.is_finite());

@@ -56,7 +56,7 @@ impl Derating {
 impl RobotModel {
     /// Returns the centre of the sphere of a hip's motors in its frame, on the side of its leg [m].
     pub fn hip_centre(&self, leg: usize) -> DVec3 {
-        let side = self.legs[leg].origins[1].y.signum();
+        let side = self.legs[leg].origins[0].y.signum();
         self.shapes.hip_centre * DVec3::new(1.0, side, 1.0)
     }
 

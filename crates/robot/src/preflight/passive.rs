@@ -313,7 +313,7 @@ fn accelerometer(acc: Vec3, expected: f32) -> Option<Finding> {
     let evidence = format!("the mean is {length:.2} in place of {expected:.2} m/s²");
     if (length - expected).abs() <= MAX_ACC_ERROR {
         None
-    } else if (length - 1.0).abs() < MAX_ACC_ERROR / GRAVITY {
+    } else if (length - expected / GRAVITY).abs() < MAX_ACC_ERROR / GRAVITY {
         let remedy = "multiply the readings by 9.81";
         Some(Finding::new("accelerometer_g", "the accelerometer is in g, not m/s²".to_owned(), evidence, remedy))
     } else {
