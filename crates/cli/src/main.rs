@@ -13,6 +13,7 @@ mod fake_process;
 mod fake_robot;
 mod fit;
 mod frame_feed;
+mod ground_arg;
 mod help;
 mod hunt;
 mod identify;

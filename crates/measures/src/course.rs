@@ -8,8 +8,6 @@ use twinstep_sim::{CourseTerrain, PatchKind};
 
 use crate::{Measure, Step};
 
-/// Forward velocity that is commanded [m/s].
-const SPEED: f32 = 0.8;
 /// Distance from the start along either axis at which a robot has arrived [m]: every step and slope of its patch is behind it.
 const ARRIVED: f32 = 3.8;
 /// Policy steps between two looks at the position.
@@ -52,16 +50,20 @@ impl CourseWalking {
     /// Time within which a robot must arrive [s].
     pub const SECONDS: f64 = 20.0;
 
+    /// Forward velocity that RoboGauge commands on stairs and obstacles [m/s].
+    pub const SPEED: f32 = 0.8;
+
     /// Prepares the measure of this number of robots on a course.
     pub fn new(terrain: CourseTerrain, robots: usize) -> Self {
         let patches = terrain.patches();
         Self { terrain, patches, starts: vec![None; robots], arrived: vec![false; robots] }
     }
 
-    /// Returns the settings of the task for a policy with these: forward, while the robot turns to a random heading.
-    pub fn task(trained: &WalkConfig) -> WalkConfig {
+    /// Returns the settings of the task for a policy with these: forward at `speed` [m/s], while the robot turns to a random
+    /// heading.
+    pub fn task(trained: &WalkConfig, speed: f32) -> WalkConfig {
         let command = CommandRanges {
-            linear_velocity_x: [SPEED; 2],
+            linear_velocity_x: [speed; 2],
             linear_velocity_y: [0.0; 2],
             angular_velocity_z: [-1.0, 1.0],
         };

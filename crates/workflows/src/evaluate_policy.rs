@@ -37,8 +37,8 @@ pub struct EvaluatePolicyOptions {
     pub engine: Option<Engine>,
     /// Names of the conditions. Empty: all.
     pub conditions: Vec<String>,
-    /// True to evaluate a policy of `walk` on a course instead.
-    pub course: bool,
+    /// Course on which a policy of `walk` is evaluated instead, with the robots, delays and pushes of the only condition.
+    pub course: Option<Course>,
     /// Number of robots.
     pub robots: u32,
     /// Simulated time of each robot [s].
@@ -47,6 +47,15 @@ pub struct EvaluatePolicyOptions {
     pub seed: u64,
     /// Film strip of a robot to write (SVG).
     pub film: Option<PathBuf>,
+}
+
+/// Course of patches over which robots walk.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Course {
+    /// Kinds and levels of its patches.
+    pub terrain: CourseTerrain,
+    /// Commanded velocity forward [m/s].
+    pub speed: f32,
 }
 
 /// What a policy does, by condition.
@@ -96,7 +105,7 @@ impl EvaluatePolicyOptions {
             model: None,
             engine: None,
             conditions: Vec::new(),
-            course: false,
+            course: None,
             robots: 256,
             seconds: 20.0,
             seed: 1_000_000,
@@ -142,8 +151,10 @@ pub fn evaluate_policy(options: &EvaluatePolicyOptions, observer: &Observer) -> 
     }
     let who = (options, &policy, observer);
     Ok(match &task {
-        TaskConfig::Walk(trained) if options.course => PolicyEvaluation::Course(course(who, trained)?),
-        other if options.course => {
+        TaskConfig::Walk(trained) if let Some(on) = options.course => {
+            PolicyEvaluation::Course(course(who, on, trained)?)
+        }
+        other if options.course.is_some() => {
             return Err(Failure::Input(miette::miette!(
                 "`--course` is for policies of `walk`, and this is one of `{}`",
                 other.name()
@@ -237,15 +248,20 @@ fn walking(who: Who, task: &TaskConfig) -> Result<Vec<Row<Evaluation>>, Failure>
 }
 
 /// Evaluates the policy on a course.
-fn course(who: Who, trained: &WalkConfig) -> Result<Vec<KindOfGround>, Failure> {
-    let (options, terrain) = (who.0, CourseTerrain::FULL);
+fn course(who: Who, Course { terrain, speed }: Course, trained: &WalkConfig) -> Result<Vec<KindOfGround>, Failure> {
+    let options = who.0;
+    let robots = match options.conditions[..] {
+        [] => Randomisation::default(),
+        [_] => options.wanted()[0].randomise,
+        _ => return Err(Failure::Input(miette::miette!("`--condition`: a course has the robots of one condition"))),
+    };
     let condition = Condition {
         name: "course",
         engine: options.engine.unwrap_or(Engine::Batch),
-        randomise: Randomisation::default(),
+        randomise: robots,
         terrain: Terrain::Course(terrain),
     };
-    let tasks = |_: &Condition| vec![(TaskConfig::Walk(CourseWalking::task(trained)), ())];
+    let tasks = |_: &Condition| vec![(TaskConfig::Walk(CourseWalking::task(trained, speed)), ())];
     let new = |_: &EnvSpec, robots: usize, (): &()| Ok(CourseWalking::new(terrain, robots));
     let run = Run { seconds: CourseWalking::SECONDS, ..run_of(options) };
     Ok(measured(who, &[condition], &tasks, run, new)?.remove(0).found.remove(0))

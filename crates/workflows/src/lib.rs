@@ -74,7 +74,7 @@ pub use comparison::Comparison;
 pub use design::{DesignOptions, Designed, design};
 pub use diagnose::{DiagnoseOptions, Diagnosed, diagnose};
 pub use evaluate::{EvaluateOptions, evaluate};
-pub use evaluate_policy::{EvaluatePolicyOptions, PolicyEvaluation, evaluate_policy};
+pub use evaluate_policy::{Course, EvaluatePolicyOptions, PolicyEvaluation, evaluate_policy};
 pub use failure::Failure;
 pub use fit::{FitOptions, Fitted, fit, fit_stages};
 pub use identify::identify;
