@@ -424,7 +424,8 @@ pub fn encode_ground(ground: &Ground) -> message::Ground<'_> {
 
 /// Decodes the reply to a render request.
 ///
-/// Fails if a body has no pose, a shape refers to a missing body, or a vertex of the ground has no height.
+/// Fails if a body has no pose, a shape refers to a missing body, a face to a missing point, or a vertex of the ground has
+/// no height.
 pub fn decode_scene(reply: message::RenderReply<'_>) -> Result<Scene, ErrorReply> {
     let message::RenderReply { bodies, pose, shapes, ground, command, .. } = reply;
     let pose: Vec<[f32; 7]> = tensor::read(pose, "pose")?;
@@ -432,6 +433,12 @@ pub fn decode_scene(reply: message::RenderReply<'_>) -> Result<Scene, ErrorReply
     if let Some(shape) = shapes.iter().find(|shape| shape.body as usize >= bodies.len()) {
         let message = format!("`shapes` has body {}; there are {}", shape.body, bodies.len());
         return Err(ErrorReply::new(ErrorCode::OutOfRange, "shapes", message));
+    }
+    for mesh in shapes.iter().filter_map(|shape| shape.mesh.as_ref()) {
+        if let Some(point) = mesh.faces.iter().flatten().find(|point| usize::from(**point) >= mesh.points.len()) {
+            let message = format!("`shapes.mesh.faces` has point {point}; there are {}", mesh.points.len());
+            return Err(ErrorReply::new(ErrorCode::OutOfRange, "shapes.mesh.faces", message));
+        }
     }
     let ground = decode_ground(ground)?;
     Ok(Scene {

@@ -140,9 +140,18 @@ fn robot_is_pushed_with_the_mouse_steered_with_the_stick_and_its_reward_terms_ar
     let viewed = Viewed::policy();
     let mut page = ChromePage::open(&browser, &viewed.url, [1000, 700]);
     page.wait_for("Number(document.body.dataset.frames) > 5", PATIENCE);
-    for curve in ["reward track_linear_velocity", "reward joint_torque", "largest torque [N·m]", "falls"] {
-        page.wait_for(&format!("document.getElementById('curves').innerText.includes('{curve}')"), PATIENCE);
+    for curve in ["forward [m/s]", "force of the ground", "track_linear_velocity", "largest torque [N·m]", "falls"] {
+        page.wait_for(&format!("document.getElementById('curves').textContent.includes('{curve}')"), PATIENCE);
     }
+    // The pointer over a curve shows the values at that time; the robot stood in the beginning.
+    let shown = "document.querySelector('#curves b:last-child').innerText";
+    page.wait_for("document.querySelector('#curves canvas').clientWidth > 100", PATIENCE);
+    page.evaluate(
+        "(() => { const box = document.querySelector('#curves canvas').getBoundingClientRect();
+         document.querySelector('#curves canvas').dispatchEvent(new PointerEvent('pointermove', { bubbles: true,
+         clientX: box.left + 46, clientY: box.top + 5 })) })()",
+    );
+    page.wait_for(&format!("Math.abs(Number({shown})) < 0.2"), PATIENCE);
     // The stick: half of its radius up is half of the largest velocity forward.
     let place = page.evaluate(
         "(() => { const box = document.getElementById('stick').getBoundingClientRect(); \
@@ -154,8 +163,8 @@ fn robot_is_pushed_with_the_mouse_steered_with_the_stick_and_its_reward_terms_ar
     page.wait_for("document.getElementById('facts').innerText.includes('0.50 0.00 0.00')", PATIENCE);
     page.release(half);
     page.wait_for("document.getElementById('facts').innerText.includes('0.00 0.00 0.00')", PATIENCE);
-    // The camera follows the robot, so that its trunk is in the middle of the window.
-    let size = page.evaluate("[innerWidth, innerHeight]");
+    // The camera follows the robot, so that its trunk is in the middle of what the panel leaves free.
+    let size = page.evaluate("[innerWidth - document.getElementById('panel').clientWidth, innerHeight]");
     let [x, y] = [0, 1].map(|index| size[index].as_f64().unwrap() / 2.0);
     page.evaluate(
         "globalThis.requests = []; const send = fetch; \
@@ -163,7 +172,7 @@ fn robot_is_pushed_with_the_mouse_steered_with_the_stick_and_its_reward_terms_ar
     );
     let place = [x + 90.0, y];
     page.press_and_move(&[[x, y], [x + 30.0, y], place]);
-    page.wait_for("document.getElementById('status').textContent.startsWith('push: ')", PATIENCE);
+    page.wait_for("document.getElementById('push-size').textContent.includes('push: ')", PATIENCE);
     page.release(place);
     page.wait_for("requests.some((body) => body.includes('push'))", PATIENCE);
     let body = page.evaluate("requests.find((body) => body.includes('push'))");

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from twinstep import EmbeddedServer, Go2Env, Go2VectorEnv
 from twinstep.render import Viewer
 from twinstep.render.height_field import HeightField, intersect_field
+from twinstep.render.shapes import Shape, shapes_of
 
 GOLDEN = Path(__file__).parents[3] / "protocol" / "golden"
 
@@ -110,6 +111,56 @@ def test_rays_hit_an_inclined_field_like_the_plane() -> None:
     normal = np.array([-np.sin(angle), 0.0, np.cos(angle)], dtype=np.float32)
     expected = -(start @ normal) / (rays @ normal)
     assert np.allclose(intersect_field(rising, start, rays), expected, atol=1e-3)
+
+
+def shape_of(kind: str, size: list[float], mesh: dict[str, Any] | None = None) -> Shape:
+    """Return a shape at (0.1, -0.2, 0.3), turned by 90 degrees about x."""
+    sent = {"body": 0, "kind": kind, "size": size, "offset": [0.1, -0.2, 0.3, 0.5**0.5, 0.5**0.5, 0, 0], "mesh": mesh}
+    still = np.array([0, 0, 0, 1, 0, 0, 0], dtype="<f4").tobytes()
+    return shapes_of({"pose": still, "shapes": [sent]})[0]
+
+
+def rays(seed: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return starts and unit directions, (200, 3) each, towards the shape and past it."""
+    random = np.random.default_rng(seed)
+    starts = random.normal(size=(200, 3)) * 2
+    towards = random.normal(size=(200, 3)) * 0.3 - starts
+    return starts.astype(np.float32), (towards / np.linalg.norm(towards, axis=1, keepdims=True)).astype(np.float32)
+
+
+def test_convex_mesh_of_a_cube_is_hit_where_the_box_is() -> None:
+    half = [0.2, 0.3, 0.4]
+    points = [[x * half[0], y * half[1], z * half[2]] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
+    sides = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    faces = [[a, b, c] for a, b, c in ([s[0], s[i], s[i + 1]] for s in sides for i in (1, 2))]
+    cube, box = shape_of("convex", [0, 0, 0], {"points": points, "faces": faces}), shape_of("box", half)
+    assert cube.planes is not None
+    assert len(cube.planes[0]) == 6, "two triangles of a side have one plane"
+    starts, directions = rays(1)
+    towards = box.centre + (starts - starts.mean(axis=0)) * 0.2 - starts[0]
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    beside = box.centre + starts * 0.2 - 3 * directions[0]
+    for start, ray in ((starts[:1], towards), (beside, directions[:1])):
+        expected = box.intersect(start, ray)
+        hit = np.isfinite(expected)
+        assert 20 < hit.sum() < 180
+        assert np.allclose(cube.intersect(start, ray), expected, atol=1e-4)
+        at = (start + ray * expected[:, None])[hit]
+        assert np.allclose(cube.normal(at), box.normal(at), atol=1e-4)
+
+
+def test_rays_end_on_the_side_or_at_an_end_of_a_cylinder() -> None:
+    cylinder = shape_of("cylinder", [0.25, 0.4, 0])
+    starts, directions = rays(2)
+    distances = np.concatenate([cylinder.intersect(s[None], d[None]) for s, d in zip(starts, directions, strict=True)])
+    hit = np.isfinite(distances)
+    assert 20 < hit.sum() < 180
+    at = ((starts + directions * distances[:, None])[hit] - cylinder.centre) @ cylinder.axes
+    radius, height = np.linalg.norm(at[:, :2], axis=1), np.abs(at[:, 2])
+    assert np.all((np.abs(radius - 0.25) < 1e-3) & (height < 0.401) | (np.abs(height - 0.4) < 1e-3) & (radius < 0.251))
+    assert np.all(
+        (cylinder.normal((starts + directions * distances[:, None])[hit]) * directions[hit]).sum(axis=1) < 0.01
+    )
 
 
 def test_height_field_is_drawn_and_hides_the_robot() -> None:

@@ -42,5 +42,6 @@ fn open(path: &Path, model: Option<&Path>, observer: &Observer) -> Result<(Playe
     // The pose of joints that the robot does not have would be the default one, whatever the log says.
     joint_indices(log.joints(), &TreeModelFile::go2().nominal.tree).map_err(input)?;
     let robot = SimulatedRobot::load(model, &log, path)?;
-    player(log, path.display().to_string(), robot, model.is_some())
+    let what = if model.is_some() { "measured motion and its simulation" } else { "measured motion" };
+    player(log, format!("{what}: {}", path.display()), robot, model.is_some())
 }

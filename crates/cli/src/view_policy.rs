@@ -7,13 +7,15 @@ use twinstep_agent::{BoundPolicy, LoadedPolicy, PolicyInput, read_contract};
 use twinstep_effects::ControlTable;
 use twinstep_env_server::{Config, EnvFactory, ServerConfig, SimEnvFactory};
 use twinstep_envs::TaskConfig;
+use twinstep_measures::CourseWalking;
 use twinstep_model::{AutoresetMode, ResetRequest, VecEnv};
-use twinstep_sim::{Engine, SimConfig};
+use twinstep_sim::{CourseTerrain, Engine, SimConfig, Terrain};
 use twinstep_viewer::{Frame, Hub, PageRequest, Playback, RobotFrame, SceneInfo};
 
 use twinstep_workflows::Observer;
 
 use crate::exit::{CommandResult, Failure, input, other};
+use crate::ground_arg::{self, GroundArg};
 use crate::serve::engine;
 use crate::velocity_input;
 use crate::web_view::PageArgs;
@@ -24,6 +26,8 @@ const IDLE: Duration = Duration::from_millis(20);
 const SPEEDS: [f64; 2] = [0.05, 4.0];
 /// Policy steps between two frames of a file.
 const STEPS_PER_FRAME: usize = 2;
+/// Velocity forward that is commanded on a course until the page has another one [m/s].
+const COURSE_SPEED: f32 = 0.5;
 /// Largest push [m/s].
 const MAX_PUSH: f32 = 3.0;
 
@@ -39,6 +43,9 @@ pub struct WalkArgs {
     /// Physics engine of a policy: batch, rapier or mujoco.
     #[arg(long, value_parser = engine, default_value = "batch")]
     engine: Engine,
+    /// Ground under a policy of `walk`: slope [rad], stairs, obstacles, wave or rough [m], such as stairs=0.15; repeat it for several.
+    #[arg(long, value_name = "KIND=SIZE", value_parser = ground_arg::ground)]
+    ground: Vec<GroundArg>,
     /// Seed of the robots of a policy.
     #[arg(long, default_value_t = 0)]
     seed: u64,
@@ -77,17 +84,24 @@ fn start(path: &Path, model: Option<&Path>, args: &WalkArgs) -> Result<(PolicyWa
     let policy = read()?;
     // A policy of this program states its gains; those of another one are in its mapping, and a model file has its own.
     let contract = policy.spec().filter(|_| model.is_none()).and_then(|_| read_contract(path).ok());
-    let factory = factory(&policy, contract, model, args.engine, robots)?;
+    let course = ground_arg::course(&args.ground);
+    let factory = factory(&policy, contract, model, args, course)?;
     let mut env = factory.build(robots, AutoresetMode::SameStep, Some(u32::MAX)).map_err(input)?;
     let load = || read()?.bind(env.spec()).map_err(input);
     let policies = (0..robots).map(|_| load()).collect::<Result<Vec<_>, _>>()?;
     env.reset(&ResetRequest::seeded(args.seed, robots)).map_err(other)?;
+    let title = format!("policy {} on {robots} simulated robots", path.display());
     let scene = SceneInfo {
         is_interactive: true,
         velocity_bounds: env.spec().observation_field("velocity_command").map(|_| velocity_input::limits()),
-        ..SceneInfo::new(path.display().to_string(), &env.scene(0).map_err(other)?, factory.robot())
+        ..SceneInfo::new(title, &env.scene(0).map_err(other)?, factory.robot())
     };
     let scene = scene.with_reward_terms(&env.spec().reward_terms);
+    // The whole course, of which the scene of a robot has a part.
+    let scene = match course {
+        Some(course) => scene.with_ground(&Terrain::Course(course).ground()),
+        None => scene,
+    };
     let walk = PolicyWalk { env, policies, command: None, is_paused: false, speed: 1.0, steps: 0, falls: 0 };
     Ok((walk, scene))
 }
@@ -97,15 +111,19 @@ fn factory(
     policy: &LoadedPolicy,
     control: Option<ControlTable>,
     model: Option<&Path>,
-    engine: Engine,
-    robots: usize,
+    args: &WalkArgs,
+    course: Option<CourseTerrain>,
 ) -> Result<SimEnvFactory, Failure> {
-    let task = policy.spec().and_then(TaskConfig::of_policy).unwrap_or_default();
+    let mut task = policy.spec().and_then(TaskConfig::of_policy).unwrap_or_default();
+    if let (TaskConfig::Walk(trained), Some(_)) = (&task, course) {
+        task = TaskConfig::Walk(CourseWalking::task(trained, COURSE_SPEED));
+    }
+    let terrain = course.map_or(Terrain::Flat, Terrain::Course);
     let config = Config {
         task,
         control,
-        server: ServerConfig { model: model.map(Path::to_owned), envs: robots, ..ServerConfig::default() },
-        sim: SimConfig { engine, threads: 1, ..SimConfig::default() },
+        server: ServerConfig { model: model.map(Path::to_owned), envs: args.robots.into(), ..ServerConfig::default() },
+        sim: SimConfig { engine: args.engine, threads: 1, terrain, ..SimConfig::default() },
         ..Config::default()
     };
     config.check().map_err(input)?;

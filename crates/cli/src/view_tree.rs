@@ -134,7 +134,8 @@ fn standing_base(model: &TreeModel, q: &[f64]) -> DAffine3 {
 
 fn info(path: &Path, tree: &RobotTree, base: DAffine3, q: &[f64]) -> SceneInfo {
     let scene = Scene::of_tree(tree, base, q, &Ground::FLAT);
-    SceneInfo { is_interactive: true, ..SceneInfo::of_tree(path.display().to_string(), &scene, tree) }
+    let title = format!("{}: each joint moves to both ends of its range", path.display());
+    SceneInfo { is_interactive: true, ..SceneInfo::of_tree(title, &scene, tree) }
 }
 
 fn curves(tree: &RobotTree, q: &[f64]) -> Curves {

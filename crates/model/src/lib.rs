@@ -32,6 +32,7 @@ mod initial_state;
 mod joint;
 mod kinematics;
 mod log_cholesky;
+mod look;
 mod mjcf;
 mod real_time;
 mod robot;
@@ -70,7 +71,7 @@ pub use robot::{
 pub use robot_sample::RobotSample;
 pub use robot_states::{GroundTruth, Measured, RobotStates, RobotStatesMut};
 pub use rollout::{HistoryStep, Precision, Rollout, RolloutRequest};
-pub use scene::{Scene, SceneShape, ShapeKind};
+pub use scene::{ConvexMesh, Scene, SceneShape, ShapeKind};
 pub use spec::{EnvSpec, SpecDifference, SpecField};
 pub use stream::{Stream, standard_normal, stream};
 pub use trajectory::Trajectory;

@@ -4,7 +4,8 @@ use glam::{DAffine3, DVec3, Quat, Vec3};
 use serde::{Deserialize, Serialize};
 
 use crate::kinematics::{Pose, body_poses};
-use crate::{Ground, JOINT_NAMES, Leg, PerJoint, RobotModel, RobotTree, TreeShape, TreeShapeKind};
+use crate::look::look;
+use crate::{Ground, JOINT_NAMES, PerJoint, RobotModel, RobotTree, TreeShape, TreeShapeKind};
 
 /// Scene for rendering. Poses are `[x, y, z, w, x, y, z]`: position [m], then quaternion.
 #[derive(Clone, Debug, PartialEq)]
@@ -32,17 +33,32 @@ pub struct Scene {
 }
 
 /// Shape of a body.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SceneShape {
     /// Index of the body in [`Scene::bodies`].
     pub body: u32,
     /// Kind of the shape, which determines the meaning of `size`.
     pub kind: ShapeKind,
-    /// Size [m]. Box: half sizes along x, y, z. Capsule: radius, half length along z without the caps, 0. Sphere:
-    /// radius, 0, 0.
+    /// Size [m]. Box: half sizes along x, y, z. Capsule: radius, half length along z without the caps, 0. Cylinder:
+    /// radius, half length along z, 0. Sphere: radius, 0, 0. Convex: 0, 0, 0.
     pub size: [f32; 3],
     /// Pose body-from-shape.
     pub offset: [f32; 7],
+    /// Colour: red, green, blue (sRGB) from 0 to 1. `None`: as the viewer likes.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub colour: Option<[f32; 3]>,
+    /// Surface of a convex shape; `None` for others.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mesh: Option<ConvexMesh>,
+}
+
+/// Surface of a convex body. The origin is inside.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ConvexMesh {
+    /// Corners [m].
+    pub points: Vec<[f32; 3]>,
+    /// Triangles: indices of `points`, counterclockwise from outside.
+    pub faces: Vec<[u16; 3]>,
 }
 
 /// Kind of a shape.
@@ -55,6 +71,10 @@ pub enum ShapeKind {
     Capsule,
     /// Sphere.
     Sphere,
+    /// Cylinder with flat ends.
+    Cylinder,
+    /// Convex body with a [`ConvexMesh`].
+    Convex,
 }
 
 impl Scene {
@@ -64,7 +84,7 @@ impl Scene {
         Self {
             bodies: ["trunk"].iter().chain(&JOINT_NAMES).map(ToString::to_string).collect(),
             pose: poses.map(Pose::to_array).to_vec(),
-            shapes: shapes(robot),
+            shapes: look(robot),
             ground: ground.crop(world_from_base.position.x, world_from_base.position.y),
             command: None,
             velocity: None,
@@ -111,74 +131,56 @@ fn pose_of(frame: DAffine3) -> Pose {
     Pose { position: position.as_vec3(), rotation: rotation.as_quat() }
 }
 
-/// Returns a shape as it is drawn: a cylinder as a capsule, an ellipsoid and a mesh as the box around them. `None` for a mesh without bounds.
+/// Returns a shape as it is drawn: an ellipsoid and a mesh as the box around them. `None` for a mesh without bounds.
 fn tree_shape(shape: &TreeShape) -> Option<SceneShape> {
     let mut frame = shape.body_from_shape;
     let (kind, size) = match shape.kind {
         TreeShapeKind::Box(half) | TreeShapeKind::Ellipsoid(half) => (ShapeKind::Box, half),
         TreeShapeKind::Sphere(radius) => (ShapeKind::Sphere, DVec3::new(radius, 0.0, 0.0)),
         TreeShapeKind::Capsule { radius, half_length } => (ShapeKind::Capsule, DVec3::new(radius, half_length, 0.0)),
-        TreeShapeKind::Cylinder { radius, half_length } => {
-            (ShapeKind::Capsule, DVec3::new(radius, (half_length - radius).max(0.0), 0.0))
-        }
+        TreeShapeKind::Cylinder { radius, half_length } => (ShapeKind::Cylinder, DVec3::new(radius, half_length, 0.0)),
         TreeShapeKind::Mesh(bounds) => {
             let [low, high] = bounds?;
             frame *= DAffine3::from_translation(0.5 * (low + high));
             (ShapeKind::Box, 0.5 * (high - low))
         }
     };
-    Some(SceneShape {
-        body: shape.body as u32,
-        kind,
-        size: size.as_vec3().to_array(),
-        offset: pose_of(frame).to_array(),
-    })
+    Some(self::shape(shape.body as u32, kind, size, pose_of(frame)))
 }
 
-/// Returns the collision shapes, and shapes only for rendering: head, hip actuators, and thigh and calf capsules.
-fn shapes(robot: &RobotModel) -> Vec<SceneShape> {
-    let collision = &robot.shapes;
-    let foot_radius = collision.foot_radius;
-    // The head is menagerie's collision geom, which the simulators do not have; the motors of the hips are spheres there.
-    let mut shapes = vec![
-        cuboid(0, collision.trunk_half_size, DVec3::ZERO),
-        capsule(0, 0.05, [DVec3::new(0.16, 0.0, 0.005), DVec3::new(0.285, 0.0, 0.01)]),
-        sphere(0, 0.047, DVec3::new(0.293, 0.0, -0.06)),
-    ];
-    for leg in Leg::ALL {
-        let hip = 1 + 3 * leg as u32;
-        let (thigh, calf) = (hip + 1, hip + 2);
-        let left = leg.left_sign();
-        let knee = robot.legs[leg as usize].origins[2];
-        shapes.extend([
-            capsule(hip, 0.04, [DVec3::ZERO, DVec3::new(0.0, 0.085 * left, 0.0)]),
-            cuboid(thigh, collision.thigh_half_size, collision.thigh_centre),
-            capsule(thigh, 1.2 * foot_radius, [DVec3::ZERO, knee]),
-            capsule(calf, collision.calf_radius, collision.calf_ends),
-            capsule(calf, 0.9 * collision.calf_radius, [collision.calf_ends[1], collision.foot_centre]),
-            sphere(calf, foot_radius, collision.foot_centre),
-        ]);
-    }
-    shapes
+fn shape(body: u32, kind: ShapeKind, size: DVec3, pose: Pose) -> SceneShape {
+    SceneShape { body, kind, size: size.as_vec3().to_array(), offset: pose.to_array(), colour: None, mesh: None }
 }
 
-fn cuboid(body: u32, half_size: DVec3, centre: DVec3) -> SceneShape {
-    let offset = Pose { position: centre.as_vec3(), rotation: Quat::IDENTITY }.to_array();
-    SceneShape { body, kind: ShapeKind::Box, size: half_size.as_vec3().to_array(), offset }
+pub(crate) fn sphere(body: u32, colour: [f32; 3], radius: f64, centre: DVec3) -> SceneShape {
+    let pose = Pose { position: centre.as_vec3(), rotation: Quat::IDENTITY };
+    SceneShape { colour: Some(colour), ..shape(body, ShapeKind::Sphere, DVec3::new(radius, 0.0, 0.0), pose) }
 }
 
-fn sphere(body: u32, radius: f64, centre: DVec3) -> SceneShape {
-    let offset = Pose { position: centre.as_vec3(), rotation: Quat::IDENTITY }.to_array();
-    SceneShape { body, kind: ShapeKind::Sphere, size: [radius as f32, 0.0, 0.0], offset }
+/// Returns the cylinder whose axis is the line segment between `ends`.
+pub(crate) fn cylinder(body: u32, colour: [f32; 3], radius: f64, ends: [DVec3; 2]) -> SceneShape {
+    SceneShape { colour: Some(colour), ..along(body, ShapeKind::Cylinder, radius, ends) }
 }
 
 /// Returns the capsule around the line segment between `ends`.
 fn capsule(body: u32, radius: f64, ends: [DVec3; 2]) -> SceneShape {
+    along(body, ShapeKind::Capsule, radius, ends)
+}
+
+/// Returns the convex body with these corners and triangles.
+pub(crate) fn convex(body: u32, colour: [f32; 3], points: &[DVec3], faces: Vec<[u16; 3]>) -> SceneShape {
+    let centre = points.iter().sum::<DVec3>() / points.len() as f64;
+    let pose = Pose { position: centre.as_vec3(), rotation: Quat::IDENTITY };
+    let points = points.iter().map(|point| (*point - centre).as_vec3().to_array()).collect();
+    let mesh = Some(ConvexMesh { points, faces });
+    SceneShape { colour: Some(colour), mesh, ..shape(body, ShapeKind::Convex, DVec3::ZERO, pose) }
+}
+
+fn along(body: u32, kind: ShapeKind, radius: f64, ends: [DVec3; 2]) -> SceneShape {
     let [from, to] = ends.map(DVec3::as_vec3);
     let rotation = Quat::from_rotation_arc(Vec3::Z, (to - from).normalize_or(Vec3::Z));
-    let offset = Pose { position: from.midpoint(to), rotation }.to_array();
-    let size = [radius as f32, 0.5 * from.distance(to), 0.0];
-    SceneShape { body, kind: ShapeKind::Capsule, size, offset }
+    let size = DVec3::new(radius, 0.5 * f64::from(from.distance(to)), 0.0);
+    shape(body, kind, size, Pose { position: from.midpoint(to), rotation })
 }
 
 #[cfg(test)]

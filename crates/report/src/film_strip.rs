@@ -57,13 +57,16 @@ fn frame(svg: &mut String, time: f64, scene: &Scene) {
     shapes.sort_by(|one, other| depth(one).total_cmp(&depth(other)));
     for shape in shapes {
         let is_far = depth(shape) < base.position.dot(left) - 0.05;
-        let colour = match (shape.body, is_far) {
-            (0, _) => "#404040",
-            (_, true) => "#f0b48c",
-            (_, false) => "#ff6a13",
-        };
-        draw(svg, &view, &world_from_shape(scene, shape), shape, colour);
+        draw(svg, &view, &world_from_shape(scene, shape), shape, &colour(shape, is_far));
     }
+}
+
+/// Returns the colour of a shape; legs on the far side are paler.
+fn colour(shape: &SceneShape, is_far: bool) -> String {
+    let own = shape.colour.unwrap_or(if shape.body == 0 { [0.25; 3] } else { [1.0, 0.42, 0.07] });
+    let [red, green, blue] =
+        own.map(|part| (255.0 * if is_far { 0.5 + 0.5 * part } else { part }).round().clamp(0.0, 255.0) as u8);
+    format!("#{red:02x}{green:02x}{blue:02x}")
 }
 
 /// A camera at the side of the robot.
@@ -82,7 +85,7 @@ impl View {
 }
 
 fn draw(svg: &mut String, view: &View, pose: &Pose, shape: &SceneShape, colour: &str) {
-    let [x, y, z] = shape.size;
+    let [x, y, _] = shape.size;
     match shape.kind {
         ShapeKind::Sphere => {
             let centre = view.project(pose.position);
@@ -107,15 +110,33 @@ fn draw(svg: &mut String, view: &View, pose: &Pose, shape: &SceneShape, colour: 
                 2.0 * SCALE * x
             );
         }
-        ShapeKind::Box => {
-            let corner = |index: u8| {
-                let sign = |bit: u8| if index >> bit & 1 == 1 { 1.0 } else { -1.0 };
-                view.project(pose.transform(Vec3::new(sign(0) * x, sign(1) * y, sign(2) * z)))
-            };
-            let hull = convex_hull((0..8).map(corner).collect());
+        ShapeKind::Box | ShapeKind::Cylinder | ShapeKind::Convex => {
+            let hull =
+                convex_hull(corners(shape).into_iter().map(|corner| view.project(pose.transform(corner))).collect());
             let points: Vec<String> = hull.iter().map(|point| format!("{:.1},{:.1}", point.x, point.y)).collect();
-            let _ = write!(svg, "<polygon points=\"{}\" fill=\"{colour}\"/>", points.join(" "));
+            let _ = write!(
+                svg,
+                "<polygon points=\"{}\" fill=\"{colour}\" stroke=\"#20242b\" stroke-width=\"0.5\"/>",
+                points.join(" ")
+            );
         }
+    }
+}
+
+/// Returns points in the frame of the shape whose convex hull is the shape [m].
+fn corners(shape: &SceneShape) -> Vec<Vec3> {
+    let [x, y, z] = shape.size;
+    let signs = [-1.0_f32, 1.0];
+    match (&shape.mesh, shape.kind) {
+        (Some(mesh), _) => mesh.points.iter().copied().map(Vec3::from).collect(),
+        (None, ShapeKind::Cylinder) => {
+            let rim = (0..24).map(|side| Vec2::from_angle(side as f32 * std::f32::consts::TAU / 24.0) * x);
+            rim.flat_map(|point| signs.map(|end| point.extend(end * y))).collect()
+        }
+        _ => signs
+            .iter()
+            .flat_map(|i| signs.iter().flat_map(move |j| signs.map(|k| Vec3::new(i * x, j * y, k * z))))
+            .collect(),
     }
 }
 

@@ -21,7 +21,7 @@ pub struct SceneInfo {
     pub torque_limits: Vec<Option<f32>>,
     /// Where the ground may push the robot, in the order of [`RobotFrame::contact_force`].
     pub contacts: Vec<Contact>,
-    /// Names of the curves that each robot has: velocity, torque, height, uncertainty of its actuators, reward terms.
+    /// Names of the curves that each robot has: torque, height, uncertainty of its actuators, reward terms.
     #[serde(default)]
     pub robot_curves: Vec<String>,
     /// True if every robot has a second pose, that of a simulation under the same commands.
@@ -105,6 +105,11 @@ impl SceneInfo {
         }
     }
 
+    /// Returns the description of a scene on this ground, which all robots share.
+    pub fn with_ground(self, ground: &Ground) -> Self {
+        Self { heights: heights(ground), ..self }
+    }
+
     /// Returns the description of a scene of robots with these reward terms.
     pub fn with_reward_terms(self, names: &[String]) -> Self {
         let quantities = QUANTITIES.iter().map(ToString::to_string);
@@ -114,19 +119,16 @@ impl SceneInfo {
 }
 
 /// Curves of a robot before its reward terms.
-const QUANTITIES: [&str; 5] =
-    ["forward [m/s]", "error, forward [m/s]", "largest torque [N·m]", "height of the trunk [m]", "uncertainty [nat]"];
+const QUANTITIES: [&str; 3] = ["largest torque [N·m]", "height of the trunk [m]", "uncertainty [nat]"];
 
 /// Returns the values of the curves of the robot of a scene; none if its reward terms are not known.
 fn robot_curves(scene: &Scene) -> Vec<f32> {
     if scene.reward_terms.is_empty() {
         return Vec::new();
     }
-    let forward = scene.velocity.map(|velocity| velocity[0]);
-    let error = scene.command.zip(forward).map(|(command, forward)| command[0] - forward);
     let torque = scene.torque.as_ref().map(|torque| torque.iter().fold(0.0_f32, |largest, tau| largest.max(tau.abs())));
     let height = scene.pose.first().map(|trunk| trunk[2]);
-    let quantities: [_; QUANTITIES.len()] = [forward, error, torque, height, scene.uncertainty];
+    let quantities: [_; QUANTITIES.len()] = [torque, height, scene.uncertainty];
     let quantities = quantities.map(|value| value.unwrap_or(f32::NAN));
     quantities.into_iter().chain(scene.reward_terms.iter().copied()).collect()
 }

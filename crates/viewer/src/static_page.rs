@@ -4,7 +4,7 @@ use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64;
 
 use crate::frame::{Frame, SceneInfo};
-use crate::web_server::{INDEX, RECORDING_SCRIPT, STYLE, THREE, VIEW_SCRIPT};
+use crate::web_server::{INDEX, MODULES, STYLE, VIEW_SCRIPT};
 
 /// Returns a page (HTML) that plays `frames` of `scene`, with pause, speed and a slider for the time.
 ///
@@ -14,20 +14,19 @@ pub fn static_page(scene: &SceneInfo, frames: &[Frame]) -> String {
     let scene = SceneInfo { is_interactive: true, is_learning: false, velocity_bounds: None, ..scene.clone() };
     // Numbers and names are always JSON. In a script `<` could begin the tag that ends it.
     let scene = serde_json::to_string(&scene).unwrap_or_default().replace('<', "\\u003c");
-    let script = |text: &str| format!("data:text/javascript;base64,{}", BASE64.encode(text));
-    let scripts = format!(
-        r#"<script type="importmap">{{"imports":{{"./three.min.js":"{}","./recording.js":"{}"}}}}</script>
-<script>globalThis.recordedScene = {scene}; globalThis.recordedFrames = "{}";</script>
+    let program = format!(
+        r#"<script>globalThis.recordedScene = {scene}; globalThis.recordedFrames = "{}";</script>
 <script type="module">{VIEW_SCRIPT}</script>"#,
-        script(THREE),
-        script(RECORDING_SCRIPT),
         BASE64.encode(bytes),
     );
-    INDEX
+    let page = INDEX
         .replace("<link rel=\"modulepreload\" href=\"three.min.js\">\n", "")
-        .replace("<link rel=\"modulepreload\" href=\"recording.js\">\n", "")
-        .replace(r#"<link rel="stylesheet" href="view.css">"#, &format!("<style>{STYLE}</style>"))
-        .replace(r#"<script type="module" src="view.js"></script>"#, &scripts)
+        .replace(r#"<link rel="stylesheet" href="view.css">"#, &format!("<style>{STYLE}</style>"));
+    let page = MODULES.iter().fold(page, |page, (name, text)| {
+        let inside = format!("\"data:text/javascript;base64,{}\"", BASE64.encode(text));
+        page.replace(&format!("\"./{name}\""), &inside)
+    });
+    page.replace(r#"<script type="module" src="view.js"></script>"#, &program)
 }
 
 #[cfg(test)]

@@ -26,21 +26,19 @@ use crate::hub::{Hub, PageRequest};
 pub(crate) const INDEX: &str = include_str!("../web/index.html");
 /// Its program.
 pub(crate) const VIEW_SCRIPT: &str = include_str!("../web/view.js");
-/// The part of its program that plays recorded frames.
-pub(crate) const RECORDING_SCRIPT: &str = include_str!("../web/recording.js");
 /// Its style.
 pub(crate) const STYLE: &str = include_str!("../web/view.css");
-/// The library that draws.
-pub(crate) const THREE: &str = include_str!("../web/three.min.js");
-
-/// Files of the page: path, type and content.
-const FILES: [(&str, &str, &str); 5] = [
-    ("/", "text/html; charset=utf-8", INDEX),
-    ("/view.js", "text/javascript; charset=utf-8", VIEW_SCRIPT),
-    ("/recording.js", "text/javascript; charset=utf-8", RECORDING_SCRIPT),
-    ("/view.css", "text/css; charset=utf-8", STYLE),
-    ("/three.min.js", "text/javascript; charset=utf-8", THREE),
+/// Modules that its program imports by the import map of the page: name and content.
+pub(crate) const MODULES: [(&str, &str); 6] = [
+    ("controls.js", include_str!("../web/controls.js")),
+    ("curves.js", include_str!("../web/curves.js")),
+    ("recording.js", include_str!("../web/recording.js")),
+    ("shapes.js", include_str!("../web/shapes.js")),
+    ("stage.js", include_str!("../web/stage.js")),
+    ("three.min.js", include_str!("../web/three.min.js")),
 ];
+const SCRIPT_TYPE: &str = "text/javascript; charset=utf-8";
+
 /// Minimum number of characters of a token.
 const MIN_TOKEN: usize = 8;
 /// Maximum number of connections. An open page has two or three.
@@ -166,8 +164,13 @@ async fn accept(listener: tokio::net::TcpListener, router: Router) {
 
 fn router(site: Arc<Site>) -> Router {
     let mut files = Router::new();
-    for (path, kind, content) in FILES {
-        files = files.route(path, get(async move || ([(header::CONTENT_TYPE, kind)], content)));
+    let pages = [("/", "text/html; charset=utf-8", INDEX), ("/view.css", "text/css; charset=utf-8", STYLE)];
+    let scripts = MODULES.into_iter().chain([("view.js", VIEW_SCRIPT)]);
+    let scripts = scripts.map(|(name, content)| (format!("/{name}"), SCRIPT_TYPE, content));
+    for (path, kind, content) in
+        pages.map(|(path, kind, content)| (path.to_owned(), kind, content)).into_iter().chain(scripts)
+    {
+        files = files.route(&path, get(async move || ([(header::CONTENT_TYPE, kind)], content)));
     }
     let protected = Router::new()
         .route("/scene", get(scene))

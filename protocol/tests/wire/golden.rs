@@ -7,7 +7,9 @@ use std::fmt::Debug;
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
-use twinstep_model::{AutoresetMode, EnvSpec, Ground, HeightField, Scene, SceneShape, ShapeKind, SpecField};
+use twinstep_model::{
+    AutoresetMode, ConvexMesh, EnvSpec, Ground, HeightField, Scene, SceneShape, ShapeKind, SpecField,
+};
 use twinstep_protocol::convert::encode_ground;
 use twinstep_protocol::message::{
     CloseReply, CloseRequest, HelloReply, HelloRequest, LeaseReply, LeaseRequest, RealTime, Reclaim, RenderReply,
@@ -345,7 +347,18 @@ fn close_has_its_golden_bytes() {
 
 /// A box with a leg that hangs 0.2 m below it.
 pub fn small_scene() -> Scene {
-    let shape = |body, kind, size, z| SceneShape { body, kind, size, offset: [0.0, 0.0, z, 1.0, 0.0, 0.0, 0.0] };
+    let shape = |body, kind, size, z| SceneShape {
+        body,
+        kind,
+        size,
+        offset: [0.0, 0.0, z, 1.0, 0.0, 0.0, 0.0],
+        colour: None,
+        mesh: None,
+    };
+    // The head, a tetrahedron.
+    let points = vec![[0.0625, 0.0, 0.0], [-0.0625, 0.0625, 0.0], [-0.0625, -0.0625, 0.0], [-0.03125, 0.0, 0.125]];
+    let mesh = Some(ConvexMesh { points, faces: vec![[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]] });
+    let head = SceneShape { colour: Some([0.75, 0.5, 0.25]), mesh, ..shape(0, ShapeKind::Convex, [0.0; 3], 0.0625) };
     Scene {
         bodies: vec!["trunk".to_owned(), "FL_hip".to_owned()],
         pose: vec![[0.5, 0.0, 0.25, 1.0, 0.0, 0.0, 0.0], [0.75, 0.125, 0.25, 0.5, 0.5, 0.5, 0.5]],
@@ -353,6 +366,8 @@ pub fn small_scene() -> Scene {
             shape(0, ShapeKind::Box, [0.25, 0.125, 0.0625], 0.0),
             shape(1, ShapeKind::Capsule, [0.03125, 0.09375, 0.0], -0.125),
             shape(1, ShapeKind::Sphere, [0.03125, 0.0, 0.0], -0.25),
+            shape(1, ShapeKind::Cylinder, [0.0625, 0.03125, 0.0], 0.0),
+            head,
         ],
         ground: Ground::FLAT,
         command: Some([1.0, 0.0, -0.5]),

@@ -66,19 +66,37 @@ fn entity(time: f64, frame_id: &str, id: &str) -> Message {
     Message::default().message(1, timestamp(time)).text(2, frame_id).text(3, id).integer(5, 1)
 }
 
-/// Adds a shape to an entity. A capsule is a cylinder with a sphere at each end.
+/// Adds a shape to an entity, in its own colour if it has one. A capsule is a cylinder with a sphere at each end.
 fn add(entity: Message, shape: &SceneShape, colour: [f64; 4]) -> Message {
     let [a, b, c] = shape.size.map(f64::from);
+    let colour = match (shape.colour, colour == GHOST) {
+        (Some([red, green, blue]), false) => [red, green, blue, 1.0].map(f64::from),
+        _ => colour,
+    };
     match shape.kind {
         ShapeKind::Box => cuboid(entity, &shape.offset, [2.0 * a, 2.0 * b, 2.0 * c], colour),
         ShapeKind::Sphere => sphere(entity, &shape.offset, a, colour),
+        ShapeKind::Cylinder => cylinder(entity, &shape.offset, [a, b], colour),
         ShapeKind::Capsule => {
-            let cylinder = primitive(&shape.offset, [2.0 * a, 2.0 * a, 2.0 * b]);
-            let cylinder = cylinder.with_number(3, 1.0).with_number(4, 1.0).message(5, numbers(colour));
             let ends = [1.0, -1.0].map(|side| end_of_capsule(&shape.offset, side * shape.size[1]));
-            ends.iter().fold(entity.message(10, cylinder), |entity, end| sphere(entity, end, a, colour))
+            let entity = cylinder(entity, &shape.offset, [a, b], colour);
+            ends.iter().fold(entity, |entity, end| sphere(entity, end, a, colour))
         }
+        ShapeKind::Convex => match &shape.mesh {
+            Some(mesh) => {
+                let points = mesh.points.iter().map(|point| point.map(f64::from));
+                let indices: Vec<u32> = mesh.faces.iter().flatten().copied().map(u32::from).collect();
+                entity.message(12, triangles(&shape.offset, points, &indices, colour))
+            }
+            None => entity,
+        },
     }
+}
+
+/// Adds a cylinder of this radius and half length.
+fn cylinder(entity: Message, pose: &[f32; 7], [radius, half_length]: [f64; 2], colour: [f64; 4]) -> Message {
+    let cylinder = primitive(pose, [2.0 * radius, 2.0 * radius, 2.0 * half_length]);
+    entity.message(10, cylinder.with_number(3, 1.0).with_number(4, 1.0).message(5, numbers(colour)))
 }
 
 /// Returns the pose `offset`, moved along its z axis by `distance` [m].
@@ -105,17 +123,10 @@ fn primitive(pose: &[f32; 7], size: [f64; 3]) -> Message {
 /// Returns a `foxglove.TriangleListPrimitive` of the ground.
 fn height_field(field: &Heights) -> Message {
     let [rows, columns] = field.shape;
-    let point = |row: usize, column: usize| {
+    let point = |index: usize| {
         let along = |index: usize, axis: usize| f64::from(field.origin[axis] + index as f32 * field.cell_size);
-        numbers([along(row, 0), along(column, 1), f64::from(field.heights[row * columns + column])])
+        [along(index / columns, 0), along(index % columns, 1), f64::from(field.heights[index])]
     };
-    let mut triangles =
-        Message::default().message(1, with_pose(Message::default(), [1, 2], &[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]));
-    for row in 0..rows {
-        for column in 0..columns {
-            triangles = triangles.message(2, point(row, column));
-        }
-    }
     let mut indices = Vec::new();
     for row in 0..rows.saturating_sub(1) {
         for column in 0..columns.saturating_sub(1) {
@@ -123,7 +134,14 @@ fn height_field(field: &Heights) -> Message {
             indices.extend([corner(0, 0), corner(1, 0), corner(1, 1), corner(0, 0), corner(1, 1), corner(0, 1)]);
         }
     }
-    triangles.message(3, numbers(GROUND)).fixed32s(5, &indices)
+    triangles(&[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (0..rows * columns).map(point), &indices, GROUND)
+}
+
+/// Returns a `foxglove.TriangleListPrimitive`.
+fn triangles(pose: &[f32; 7], points: impl Iterator<Item = [f64; 3]>, indices: &[u32], colour: [f64; 4]) -> Message {
+    let list = Message::default().message(1, with_pose(Message::default(), [1, 2], pose));
+    let list = points.fold(list, |list, point| list.message(2, numbers(point)));
+    list.message(3, numbers(colour)).fixed32s(5, indices)
 }
 
 /// Adds position and orientation to a message, in these fields.

@@ -12,11 +12,6 @@ from .array import Array
 from .camera import Camera
 from .shapes import Shape
 
-_COLOURS: dict[str, tuple[float, float, float]] = {
-    "box": (208, 212, 218),
-    "capsule": (122, 130, 142),
-    "sphere": (38, 40, 46),
-}
 _AMBIENT, _DIFFUSE, _SHADOW = 0.5, 0.55, 0.55
 
 
@@ -69,6 +64,5 @@ class FrameBuffer:
         # Surfaces that face the sky get more ambient light.
         brightness = _AMBIENT * (0.75 + 0.25 * light[:, 2]) + _DIFFUSE * facing
         shine = facing**24
-        colour = np.array(_COLOURS[shape.kind], dtype=np.float32)
-        shaded = np.minimum(colour[:, None] * brightness + 40 * shine, 255)
+        shaded = np.minimum(shape.colour[:, None] * brightness + 40 * shine, 255)
         self._colour[:, top:bottom, left:right][:, seen] = shaded

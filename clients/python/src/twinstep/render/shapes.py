@@ -1,4 +1,4 @@
-"""Shapes of a robot: boxes, capsules and spheres, and their intersections with rays."""
+"""Shapes of a robot: boxes, capsules, cylinders, spheres and convex meshes, and their intersections with rays."""
 
 from __future__ import annotations
 
@@ -10,28 +10,43 @@ import numpy as np
 
 from .array import Array
 
+_COLOURS = {
+    kind: np.array(colour, dtype=np.float32)
+    for kind, colour in (
+        ("box", (208, 212, 218)),
+        ("capsule", (122, 130, 142)),
+        ("cylinder", (122, 130, 142)),
+        ("convex", (208, 212, 218)),
+        ("sphere", (38, 40, 46)),
+    )
+}
+"""Colours of shapes that were sent without one."""
+
 
 @dataclass(frozen=True)
 class Shape:
-    """A shape in the world frame: a box, a capsule or a sphere (a capsule of length 0)."""
+    """A shape in the world frame. A sphere is a capsule of length 0."""
 
     kind: str
     size: Array
-    """(3,), as in the message [m]."""
+    """(3,), as in the message [m]; of a mesh, half sizes of the box around it."""
+    colour: Array
+    """(3,), red, green, blue from 0 to 255."""
     centre: Array
     """(3,), position of the centre [m]."""
     axes: Array
     """(3, 3), world-from-shape rotation."""
-
-    @property
-    def radius(self) -> float:
-        """Radius of the bounding sphere [m]."""
-        return float(np.linalg.norm(self.size)) if self.kind == "box" else float(self.size[0] + self.size[1])
+    planes: tuple[Array, Array] | None = None
+    """Of a convex mesh: outward unit normals (n, 3) of its faces and their distances (n,) from the centre [m]."""
 
     def corners(self) -> Array:
         """Return points whose convex hull contains the shape, (8, 3) [m]."""
         signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float32)
-        half = self.size if self.kind == "box" else self.size[0] + np.array([0, 0, self.size[1]], dtype=np.float32)
+        half = self.size
+        if self.kind in ("capsule", "sphere"):
+            half = self.size[0] + np.array([0, 0, self.size[1]], dtype=np.float32)
+        elif self.kind == "cylinder":
+            half = self.size[[0, 0, 1]]
         return self.centre + (signs * half) @ self.axes.T
 
     def intersect(self, origins: Array, rays: Array) -> Array:
@@ -52,6 +67,10 @@ class Shape:
         start, ray = (origins - self.centre) @ self.axes, rays @ self.axes
         if self.kind == "box":
             return _intersect_box(start, ray, self.size)
+        if self.planes is not None:
+            return _intersect_planes(start, ray, *self.planes)
+        if self.kind == "cylinder":
+            return _intersect_cylinder(start, ray, float(self.size[0]), float(self.size[1]))
         return _intersect_capsule(start, ray, float(self.size[0]), float(self.size[1]))
 
     def normal(self, points: Array) -> Array:
@@ -62,6 +81,14 @@ class Shape:
             rows = np.arange(len(own))
             normal = np.zeros_like(own)
             normal[rows, face] = np.sign(own[rows, face])
+        elif self.planes is not None:
+            normals, distances = self.planes
+            normal = normals[(_products(normals, own) - distances[:, None]).argmax(axis=0)]
+        elif self.kind == "cylinder":
+            along = np.abs(own[:, 2]) - self.size[1]
+            at_end = along > np.linalg.norm(own[:, :2], axis=1) - self.size[0]
+            normal = own * np.array([1, 1, 0], dtype=np.float32) / self.size[0]
+            normal[at_end] = np.sign(own[at_end, 2:]) * np.array([0, 0, 1], dtype=np.float32)
         else:
             own[:, 2] -= np.clip(own[:, 2], -self.size[1], self.size[1])
             normal = own / self.size[0]
@@ -78,8 +105,25 @@ def shapes_of(scene: Mapping[str, object]) -> list[Shape]:
         body = int(sent["body"])
         world_from_body, origin = rotations[body], pose[body, :3]
         axes = world_from_body @ _rotation(offset[3:])
-        shapes.append(Shape(sent["kind"], size, origin + world_from_body @ offset[:3], axes))
+        kind, planes = str(sent["kind"]), None
+        if kind == "convex":
+            size, planes = _box_and_planes(sent["mesh"])
+        colour = sent.get("colour")
+        shade = _COLOURS[kind] if colour is None else np.asarray(colour, dtype=np.float32) * 255
+        shapes.append(Shape(kind, size, shade, origin + world_from_body @ offset[:3], axes, planes))
     return shapes
+
+
+def _box_and_planes(mesh: Mapping[str, Any]) -> tuple[Array, tuple[Array, Array]]:
+    """Return half sizes of the box around a mesh and its centre, and the planes of its faces."""
+    points = np.asarray(mesh["points"], dtype=np.float32)
+    a, b, c = points[np.asarray(mesh["faces"], dtype=np.intp)].transpose(1, 0, 2)
+    normals = np.cross(b - a, c - a)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    planes = np.column_stack([normals, (normals * a).sum(axis=1)])
+    # Triangles of one face have one plane.
+    _, first = np.unique(planes.round(4), axis=0, return_index=True)
+    return np.abs(points).max(axis=0), (normals[first], planes[first, 3])
 
 
 def _rotation(quaternion: Array) -> Array:
@@ -104,6 +148,49 @@ def _intersect_box(start: Array, ray: Array, half: Array) -> Array:
         middle, reach = -start[:, axis] / direction, half[axis] / np.abs(direction)
         enter, leave = np.maximum(enter, middle - reach), np.minimum(leave, middle + reach)
     return np.where((enter < leave) & (enter > 0), enter, np.float32(np.inf)).astype(np.float32)
+
+
+def _intersect_planes(start: Array, ray: Array, normals: Array, distances: Array) -> Array:
+    """Return the distances (n,) along rays to a convex mesh, as in :func:`_intersect_box`."""
+    if len(start) == 1:
+        # Rays from one point: it is outside of the same planes for all of them, and one over the distance is linear.
+        height = distances - normals @ start[0]
+        inverse = normals / np.where(np.abs(height) < 1e-9, np.float32(1e-9), height)[:, None]
+        is_outside = height < 0
+        last = _products(inverse[is_outside], ray).min(axis=0, initial=np.inf)
+        first = _products(inverse[~is_outside], ray).max(axis=0, initial=-np.inf)
+        hit = (last > 0) & np.isfinite(last) & (last > first)
+        return np.where(hit, 1 / np.where(hit, last, 1), np.inf).astype(np.float32)
+    # Parallel rays: all of them enter by the same planes, and the distance is linear.
+    approach = normals @ ray[0]
+    scale = 1 / np.where(np.abs(approach) < 1e-9, np.float32(1e-9), approach)
+    cut = (distances * scale)[:, None] - _products(normals * scale[:, None], start)
+    enter = cut[approach < 0].max(axis=0, initial=-np.inf)
+    leave = cut[approach >= 0].min(axis=0, initial=np.inf)
+    return np.where((enter < leave) & (enter > 0), enter, np.inf).astype(np.float32)
+
+
+def _products(normals: Array, vectors: Array) -> Array:
+    """Return the products (p, n) of normals (p, 3) and vectors (n, 3).
+
+    Not with ``@``, whose threads wait for each other while a simulation uses all cores.
+    """
+    products: Array = np.einsum("pi,in->pn", normals, np.ascontiguousarray(vectors.T))
+    return products
+
+
+def _intersect_cylinder(start: Array, ray: Array, radius: float, half_length: float) -> Array:
+    """Return the distances (n,) along rays to a cylinder along z around the origin, as in :func:`_intersect_box`."""
+    (x, y, z), (u, v, w) = start.T, ray.T
+    across, flat = x * u + y * v, u * u + v * v + np.float32(1e-9)
+    under = across * across - flat * (x * x + y * y - np.float32(radius**2))
+    root = np.sqrt(np.maximum(under, 0))
+    w = np.where(np.abs(w) < 1e-7, np.float32(1e-7), w)
+    middle, reach = -z / w, np.float32(half_length) / np.abs(w)
+    enter = np.maximum((-across - root) / flat, middle - reach)
+    leave = np.minimum((root - across) / flat, middle + reach)
+    hit = (under > 0) & (enter < leave) & (enter > 0)
+    return np.where(hit, enter, np.float32(np.inf)).astype(np.float32)
 
 
 def _intersect_capsule(start: Array, ray: Array, radius: float, half_length: float) -> Array:

@@ -1,0 +1,247 @@
+//! How a quadruped like the Go2 is drawn: a shell, motors and low-poly links with the dimensions of its model.
+//!
+//! Nothing collides with these parts. Their proportions are those of a Go2, scaled by the distances between the joints.
+
+use glam::{DVec2, DVec3};
+
+use crate::scene::{SceneShape, convex, cylinder, sphere};
+use crate::{Leg, RobotModel};
+
+/// Colours (sRGB, from 0 to 1): painted shell, dark plastic, motor, steel, rubber.
+const SHELL: [f32; 3] = [0.82, 0.84, 0.86];
+const PLASTIC: [f32; 3] = [0.20, 0.21, 0.24];
+const MOTOR: [f32; 3] = [0.31, 0.33, 0.37];
+const STEEL: [f32; 3] = [0.58, 0.61, 0.65];
+const RUBBER: [f32; 3] = [0.09, 0.09, 0.10];
+
+/// Length of the Go2's thigh [m], for which the numbers below are given.
+const GO2_THIGH: f64 = 0.213;
+
+/// Axis along which a part is extruded.
+#[derive(Clone, Copy)]
+enum Axis {
+    X,
+    Y,
+    Z,
+}
+
+impl Axis {
+    /// Returns the point at `along` this axis and at `across` the other two, in cyclic order.
+    fn point(self, along: f64, across: DVec2) -> DVec3 {
+        match self {
+            Self::X => DVec3::new(along, across.x, across.y),
+            Self::Y => DVec3::new(across.y, along, across.x),
+            Self::Z => DVec3::new(across.x, across.y, along),
+        }
+    }
+}
+
+/// Cross-section of a part: a rectangle whose corners are cut at 45°.
+#[derive(Clone, Copy)]
+struct Section {
+    /// Position along the axis [m].
+    along: f64,
+    /// Position across the axis [m].
+    centre: DVec2,
+    /// Half of both sides [m].
+    half: DVec2,
+    /// Length that is cut from each side at a corner [m].
+    bevel: f64,
+}
+
+fn section(along: f64, centre: [f64; 2], half: [f64; 2], bevel: f64) -> Section {
+    Section { along, centre: DVec2::from(centre), half: DVec2::from(half), bevel }
+}
+
+impl Section {
+    /// Returns the corners, counterclockwise about the axis.
+    fn corners(&self) -> [DVec2; 8] {
+        let (DVec2 { x, y }, cut) = (self.half, self.bevel);
+        [
+            (x, cut - y),
+            (x, y - cut),
+            (x - cut, y),
+            (cut - x, y),
+            (-x, y - cut),
+            (-x, cut - y),
+            (cut - x, -y),
+            (x - cut, -y),
+        ]
+        .map(|(u, v)| self.centre + DVec2::new(u, v))
+    }
+}
+
+/// Returns the convex part through `sections`, which are in the order of their positions and alike in the side of the
+/// bevel: so all its faces are plane.
+fn loft(body: u32, colour: [f32; 3], axis: Axis, scale: f64, sections: &[Section]) -> SceneShape {
+    let corners = |section: &Section| section.corners().map(|across| scale * axis.point(section.along, across));
+    let points: Vec<DVec3> = sections.iter().flat_map(corners).collect();
+    let mut faces = Vec::new();
+    for low in 0..sections.len() as u16 - 1 {
+        for corner in 0..8 {
+            let [from, to] = [corner, (corner + 1) % 8].map(|corner| 8 * low + corner);
+            faces.extend([[from, to, to + 8], [from, to + 8, from + 8]]);
+        }
+    }
+    let top = points.len() as u16 - 8;
+    for corner in 1..7 {
+        faces.extend([[0, corner + 1, corner], [top, top + corner, top + corner + 1]]);
+    }
+    convex(body, colour, &points, faces)
+}
+
+/// Returns the parts of a robot, each on the body of its joint.
+pub(crate) fn look(robot: &RobotModel) -> Vec<SceneShape> {
+    let mut parts = trunk(robot);
+    parts.extend(Leg::ALL.into_iter().flat_map(|leg| self::leg(robot, leg)));
+    parts
+}
+
+/// The shell between the hips, the housings of the hip motors before and behind it, the head and its lidar.
+fn trunk(robot: &RobotModel) -> Vec<SceneShape> {
+    let hip = robot.legs[0].origins[0].abs();
+    let scale = hip.x / 0.1934;
+    let part = |colour, sections: &[Section]| loft(0, colour, Axis::X, scale, sections);
+    let shell = |x: f64, [y, z]: [f64; 2]| section(x, [0.0, 0.006], [y, z], 0.026);
+    let housing = |x: f64, [y, z]: [f64; 2]| section(x, [0.0, 0.0], [y, z], 0.03);
+    let head = |x: f64, z: f64, half: [f64; 2]| section(x, [0.0, z], half, 0.018);
+    vec![
+        part(
+            SHELL,
+            &[
+                shell(-0.165, [0.074, 0.042]),
+                shell(-0.14, [0.094, 0.058]),
+                shell(0.14, [0.094, 0.058]),
+                shell(0.165, [0.074, 0.042]),
+            ],
+        ),
+        part(
+            PLASTIC,
+            &[section(-0.12, [0.0, 0.066], [0.05, 0.006], 0.005), section(0.12, [0.0, 0.066], [0.05, 0.006], 0.005)],
+        ),
+        part(
+            PLASTIC,
+            &[section(-0.13, [0.0, -0.052], [0.06, 0.012], 0.01), section(0.13, [0.0, -0.052], [0.06, 0.012], 0.01)],
+        ),
+        part(PLASTIC, &[housing(0.15, [0.072, 0.044]), housing(0.225, [0.072, 0.044]), housing(0.238, [0.06, 0.036])]),
+        part(
+            PLASTIC,
+            &[housing(-0.238, [0.06, 0.036]), housing(-0.225, [0.072, 0.044]), housing(-0.15, [0.072, 0.044])],
+        ),
+        part(
+            SHELL,
+            &[
+                head(0.205, 0.024, [0.066, 0.034]),
+                head(0.27, 0.024, [0.058, 0.034]),
+                head(0.32, 0.012, [0.038, 0.024]),
+            ],
+        ),
+        part(PLASTIC, &[head(0.31, 0.010, [0.036, 0.022]), head(0.328, 0.008, [0.028, 0.019])]),
+        part(
+            PLASTIC,
+            &[section(0.25, [0.0, -0.022], [0.034, 0.026], 0.012), section(0.30, [0.0, -0.018], [0.03, 0.022], 0.012)],
+        ),
+        cylinder(
+            0,
+            MOTOR,
+            scale * 0.042,
+            [DVec3::new(0.288, 0.0, -0.06), DVec3::new(0.288, 0.0, -0.03)].map(|end| scale * end),
+        ),
+        sphere(0, RUBBER, scale * 0.04, scale * DVec3::new(0.288, 0.0, -0.062)),
+    ]
+}
+
+/// One leg: the motors of abduction, hip and knee, thigh, shank and foot.
+fn leg(robot: &RobotModel, leg: Leg) -> Vec<SceneShape> {
+    let [_, thigh_origin, calf_origin] = robot.legs[leg as usize].origins;
+    let scale = calf_origin.length() / GO2_THIGH;
+    let side = thigh_origin.y.signum();
+    // Outwards from the hip joint [m of a Go2].
+    let out = thigh_origin.y.abs() / scale;
+    let (hip, thigh, calf) = (1 + 3 * leg as u32, 2 + 3 * leg as u32, 3 + 3 * leg as u32);
+    let across = |from: f64, to: f64| [from, to].map(|y| scale * DVec3::new(0.0, side * y, 0.0));
+    let plate = |z: f64, x: f64, half: [f64; 2]| section(z, [x, side * 0.004], half, 0.009);
+    let shank = |z: f64, x: f64, half: [f64; 2]| section(z, [x, 0.0], half, 0.006);
+    let arm = |y: f64| section(side * y, [0.0, 0.0], [0.032, 0.034], 0.012);
+    let mut arms = [arm(0.02), arm(out - 0.03)];
+    arms.sort_by(|one, other| one.along.total_cmp(&other.along));
+    let foot = robot.shapes.foot_centre;
+    let length = foot.length() / scale;
+    vec![
+        cylinder(hip, MOTOR, scale * 0.044, [-0.037, 0.037].map(|x| scale * DVec3::new(x, 0.0, 0.0))),
+        loft(hip, PLASTIC, Axis::Y, scale, &arms),
+        cylinder(hip, MOTOR, scale * 0.049, across(out - 0.052, out - 0.014)),
+        cylinder(thigh, MOTOR, scale * 0.048, across(-0.012, 0.042)),
+        cylinder(thigh, STEEL, scale * 0.030, across(0.042, 0.046)),
+        loft(
+            thigh,
+            SHELL,
+            Axis::Z,
+            scale,
+            &[
+                plate(-GO2_THIGH - 0.014, 0.0, [0.013, 0.013]),
+                plate(-GO2_THIGH + 0.01, -0.001, [0.019, 0.015]),
+                plate(-0.11, -0.006, [0.033, 0.019]),
+                plate(-0.03, -0.006, [0.044, 0.021]),
+                plate(0.02, 0.0, [0.036, 0.021]),
+            ],
+        ),
+        cylinder(calf, MOTOR, scale * 0.021, across(-0.020, 0.024)),
+        loft(
+            calf,
+            PLASTIC,
+            Axis::Z,
+            scale,
+            &[
+                shank(-0.12, 0.012, [0.010, 0.009]),
+                shank(-0.02, 0.003, [0.017, 0.013]),
+                shank(0.012, -0.002, [0.013, 0.012]),
+            ],
+        ),
+        loft(
+            calf,
+            PLASTIC,
+            Axis::Z,
+            scale,
+            &[shank(-length + 0.008, foot.x / scale, [0.009, 0.009]), shank(-0.115, 0.012, [0.010, 0.009])],
+        ),
+        sphere(calf, RUBBER, robot.shapes.foot_radius, foot),
+    ]
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::Vec3;
+
+    use super::*;
+    use crate::go2;
+
+    #[test]
+    fn every_part_is_convex_and_its_faces_look_outwards() {
+        {
+            for mesh in look(&go2()).iter().filter_map(|part| part.mesh.as_ref()) {
+                let points: Vec<Vec3> = mesh.points.iter().copied().map(Vec3::from).collect();
+                for face in &mesh.faces {
+                    let [a, b, c] = face.map(|point| points[usize::from(point)]);
+                    let normal = (b - a).cross(c - a).normalize();
+                    for point in &points {
+                        assert!(normal.dot(*point - a) < 1e-5, "{point} is outside of {face:?}");
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn feet_and_knees_are_where_the_model_has_them() {
+        let robot = go2();
+        let parts = look(&robot);
+        for leg in 0..4_u32 {
+            let of_calf: Vec<_> = parts.iter().filter(|part| part.body == 3 + 3 * leg).collect();
+            let centre = |part: &SceneShape| Vec3::from_slice(&part.offset[..3]);
+            let foot = robot.shapes.foot_centre.as_vec3();
+            assert!(of_calf.iter().any(|part| (centre(part) - foot).length() < 1e-6));
+            assert!(of_calf.iter().any(|part| centre(part).length() < 0.01), "the knee is at the origin of the calf");
+        }
+    }
+}
