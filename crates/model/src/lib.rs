@@ -40,6 +40,7 @@ mod robot_sample;
 mod robot_states;
 mod rollout;
 mod scene;
+mod scene_shape;
 mod spec;
 mod stream;
 mod trajectory;
@@ -71,7 +72,8 @@ pub use robot::{
 pub use robot_sample::RobotSample;
 pub use robot_states::{GroundTruth, Measured, RobotStates, RobotStatesMut};
 pub use rollout::{HistoryStep, Precision, Rollout, RolloutRequest};
-pub use scene::{ConvexMesh, Scene, SceneShape, ShapeKind};
+pub use scene::Scene;
+pub use scene_shape::{ConvexMesh, SceneShape, ShapeKind};
 pub use spec::{EnvSpec, SpecDifference, SpecField};
 pub use stream::{Stream, standard_normal, stream};
 pub use trajectory::Trajectory;

@@ -2,10 +2,12 @@
 //!
 //! Nothing collides with these parts. Their proportions are those of a Go2, scaled by the distances between the joints.
 
+use std::cell::RefCell;
+
 use glam::{DVec2, DVec3};
 
-use crate::scene::{SceneShape, convex, cylinder, sphere};
-use crate::{Leg, RobotModel};
+use crate::scene_shape::{SceneShape, convex, cylinder, sphere};
+use crate::{NUM_LEGS, RobotModel};
 
 /// Colours (sRGB, from 0 to 1): painted shell, dark plastic, motor, steel, rubber.
 const SHELL: [f32; 3] = [0.82, 0.84, 0.86];
@@ -90,16 +92,42 @@ fn loft(body: u32, colour: [f32; 3], axis: Axis, scale: f64, sections: &[Section
     convex(body, colour, &points, faces)
 }
 
+/// What the parts depend on.
+#[derive(Clone, Copy, PartialEq)]
+struct Dimensions {
+    origins: [[DVec3; 3]; NUM_LEGS],
+    foot_centre: DVec3,
+    foot_radius: f64,
+}
+
+thread_local! {
+    /// Parts of the last robot: a measure asks for the scene of every robot in every step.
+    static LAST: RefCell<Option<(Dimensions, Vec<SceneShape>)>> = const { RefCell::new(None) };
+}
+
 /// Returns the parts of a robot, each on the body of its joint.
 pub(crate) fn look(robot: &RobotModel) -> Vec<SceneShape> {
-    let mut parts = trunk(robot);
-    parts.extend(Leg::ALL.into_iter().flat_map(|leg| self::leg(robot, leg)));
-    parts
+    let RobotModel { legs, shapes, .. } = robot;
+    let dimensions = Dimensions {
+        origins: std::array::from_fn(|leg| legs[leg].origins),
+        foot_centre: shapes.foot_centre,
+        foot_radius: shapes.foot_radius,
+    };
+    LAST.with_borrow_mut(|last| match last {
+        Some((known, parts)) if *known == dimensions => parts.clone(),
+        _ => last.insert((dimensions, dimensions.parts())).1.clone(),
+    })
+}
+
+impl Dimensions {
+    fn parts(&self) -> Vec<SceneShape> {
+        trunk(self).into_iter().chain((0..NUM_LEGS).flat_map(|leg| self::leg(self, leg))).collect()
+    }
 }
 
 /// The shell between the hips, the housings of the hip motors before and behind it, the head and its lidar.
-fn trunk(robot: &RobotModel) -> Vec<SceneShape> {
-    let hip = robot.legs[0].origins[0].abs();
+fn trunk(robot: &Dimensions) -> Vec<SceneShape> {
+    let hip = robot.origins[0][0].abs();
     let scale = hip.x / 0.1934;
     let part = |colour, sections: &[Section]| loft(0, colour, Axis::X, scale, sections);
     let shell = |x: f64, [y, z]: [f64; 2]| section(x, [0.0, 0.006], [y, z], 0.026);
@@ -130,11 +158,7 @@ fn trunk(robot: &RobotModel) -> Vec<SceneShape> {
         ),
         part(
             SHELL,
-            &[
-                head(0.205, 0.024, [0.066, 0.034]),
-                head(0.27, 0.024, [0.058, 0.034]),
-                head(0.32, 0.012, [0.038, 0.024]),
-            ],
+            &[head(0.205, 0.024, [0.066, 0.034]), head(0.27, 0.024, [0.058, 0.034]), head(0.32, 0.012, [0.038, 0.024])],
         ),
         part(PLASTIC, &[head(0.31, 0.010, [0.036, 0.022]), head(0.328, 0.008, [0.028, 0.019])]),
         part(
@@ -152,20 +176,20 @@ fn trunk(robot: &RobotModel) -> Vec<SceneShape> {
 }
 
 /// One leg: the motors of abduction, hip and knee, thigh, shank and foot.
-fn leg(robot: &RobotModel, leg: Leg) -> Vec<SceneShape> {
-    let [_, thigh_origin, calf_origin] = robot.legs[leg as usize].origins;
+fn leg(robot: &Dimensions, leg: usize) -> Vec<SceneShape> {
+    let [_, thigh_origin, calf_origin] = robot.origins[leg];
     let scale = calf_origin.length() / GO2_THIGH;
     let side = thigh_origin.y.signum();
     // Outwards from the hip joint [m of a Go2].
     let out = thigh_origin.y.abs() / scale;
-    let (hip, thigh, calf) = (1 + 3 * leg as u32, 2 + 3 * leg as u32, 3 + 3 * leg as u32);
+    let [hip, thigh, calf] = [1, 2, 3].map(|body| body + 3 * leg as u32);
     let across = |from: f64, to: f64| [from, to].map(|y| scale * DVec3::new(0.0, side * y, 0.0));
     let plate = |z: f64, x: f64, half: [f64; 2]| section(z, [x, side * 0.004], half, 0.009);
     let shank = |z: f64, x: f64, half: [f64; 2]| section(z, [x, 0.0], half, 0.006);
     let arm = |y: f64| section(side * y, [0.0, 0.0], [0.032, 0.034], 0.012);
     let mut arms = [arm(0.02), arm(out - 0.03)];
     arms.sort_by(|one, other| one.along.total_cmp(&other.along));
-    let foot = robot.shapes.foot_centre;
+    let foot = robot.foot_centre;
     let length = foot.length() / scale;
     vec![
         cylinder(hip, MOTOR, scale * 0.044, [-0.037, 0.037].map(|x| scale * DVec3::new(x, 0.0, 0.0))),
@@ -205,7 +229,7 @@ fn leg(robot: &RobotModel, leg: Leg) -> Vec<SceneShape> {
             scale,
             &[shank(-length + 0.008, foot.x / scale, [0.009, 0.009]), shank(-0.115, 0.012, [0.010, 0.009])],
         ),
-        sphere(calf, RUBBER, robot.shapes.foot_radius, foot),
+        sphere(calf, RUBBER, robot.foot_radius, foot),
     ]
 }
 
@@ -229,6 +253,16 @@ mod tests {
                     }
                 }
             }
+        }
+    }
+
+    #[test]
+    fn another_robot_has_its_own_parts() {
+        let (small, mut large) = (go2(), go2());
+        large.shapes.foot_radius *= 2.0;
+        let radius = |robot: &RobotModel| look(robot).last().expect("a foot").size[0];
+        for _ in 0..2 {
+            assert_eq!(radius(&large), 2.0 * radius(&small));
         }
     }
 

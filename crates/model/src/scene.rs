@@ -1,10 +1,10 @@
 //! Scene for rendering one robot: bodies, their shapes and poses, and the ground.
 
-use glam::{DAffine3, DVec3, Quat, Vec3};
-use serde::{Deserialize, Serialize};
+use glam::{DAffine3, DVec3};
 
 use crate::kinematics::{Pose, body_poses};
 use crate::look::look;
+use crate::scene_shape::{SceneShape, ShapeKind, capsule};
 use crate::{Ground, JOINT_NAMES, PerJoint, RobotModel, RobotTree, TreeShape, TreeShapeKind};
 
 /// Scene for rendering. Poses are `[x, y, z, w, x, y, z]`: position [m], then quaternion.
@@ -30,51 +30,6 @@ pub struct Scene {
     pub reward_terms: Vec<f32>,
     /// Epistemic uncertainty of the actuators [nat]. `None` if it is not known; a server does not send it.
     pub uncertainty: Option<f32>,
-}
-
-/// Shape of a body.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct SceneShape {
-    /// Index of the body in [`Scene::bodies`].
-    pub body: u32,
-    /// Kind of the shape, which determines the meaning of `size`.
-    pub kind: ShapeKind,
-    /// Size [m]. Box: half sizes along x, y, z. Capsule: radius, half length along z without the caps, 0. Cylinder:
-    /// radius, half length along z, 0. Sphere: radius, 0, 0. Convex: 0, 0, 0.
-    pub size: [f32; 3],
-    /// Pose body-from-shape.
-    pub offset: [f32; 7],
-    /// Colour: red, green, blue (sRGB) from 0 to 1. `None`: as the viewer likes.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub colour: Option<[f32; 3]>,
-    /// Surface of a convex shape; `None` for others.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub mesh: Option<ConvexMesh>,
-}
-
-/// Surface of a convex body. The origin is inside.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct ConvexMesh {
-    /// Corners [m].
-    pub points: Vec<[f32; 3]>,
-    /// Triangles: indices of `points`, counterclockwise from outside.
-    pub faces: Vec<[u16; 3]>,
-}
-
-/// Kind of a shape.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum ShapeKind {
-    /// Box.
-    Box,
-    /// Cylinder with half spheres at its ends.
-    Capsule,
-    /// Sphere.
-    Sphere,
-    /// Cylinder with flat ends.
-    Cylinder,
-    /// Convex body with a [`ConvexMesh`].
-    Convex,
 }
 
 impl Scene {
@@ -145,46 +100,13 @@ fn tree_shape(shape: &TreeShape) -> Option<SceneShape> {
             (ShapeKind::Box, 0.5 * (high - low))
         }
     };
-    Some(self::shape(shape.body as u32, kind, size, pose_of(frame)))
-}
-
-fn shape(body: u32, kind: ShapeKind, size: DVec3, pose: Pose) -> SceneShape {
-    SceneShape { body, kind, size: size.as_vec3().to_array(), offset: pose.to_array(), colour: None, mesh: None }
-}
-
-pub(crate) fn sphere(body: u32, colour: [f32; 3], radius: f64, centre: DVec3) -> SceneShape {
-    let pose = Pose { position: centre.as_vec3(), rotation: Quat::IDENTITY };
-    SceneShape { colour: Some(colour), ..shape(body, ShapeKind::Sphere, DVec3::new(radius, 0.0, 0.0), pose) }
-}
-
-/// Returns the cylinder whose axis is the line segment between `ends`.
-pub(crate) fn cylinder(body: u32, colour: [f32; 3], radius: f64, ends: [DVec3; 2]) -> SceneShape {
-    SceneShape { colour: Some(colour), ..along(body, ShapeKind::Cylinder, radius, ends) }
-}
-
-/// Returns the capsule around the line segment between `ends`.
-fn capsule(body: u32, radius: f64, ends: [DVec3; 2]) -> SceneShape {
-    along(body, ShapeKind::Capsule, radius, ends)
-}
-
-/// Returns the convex body with these corners and triangles.
-pub(crate) fn convex(body: u32, colour: [f32; 3], points: &[DVec3], faces: Vec<[u16; 3]>) -> SceneShape {
-    let centre = points.iter().sum::<DVec3>() / points.len() as f64;
-    let pose = Pose { position: centre.as_vec3(), rotation: Quat::IDENTITY };
-    let points = points.iter().map(|point| (*point - centre).as_vec3().to_array()).collect();
-    let mesh = Some(ConvexMesh { points, faces });
-    SceneShape { colour: Some(colour), mesh, ..shape(body, ShapeKind::Convex, DVec3::ZERO, pose) }
-}
-
-fn along(body: u32, kind: ShapeKind, radius: f64, ends: [DVec3; 2]) -> SceneShape {
-    let [from, to] = ends.map(DVec3::as_vec3);
-    let rotation = Quat::from_rotation_arc(Vec3::Z, (to - from).normalize_or(Vec3::Z));
-    let size = DVec3::new(radius, 0.5 * f64::from(from.distance(to)), 0.0);
-    shape(body, kind, size, Pose { position: from.midpoint(to), rotation })
+    Some(crate::scene_shape::shape(shape.body as u32, kind, size, pose_of(frame)))
 }
 
 #[cfg(test)]
 mod tests {
+    use glam::{Quat, Vec3};
+
     use super::*;
     use crate::{NUM_BODIES, go2};
 
@@ -213,14 +135,5 @@ mod tests {
             assert!((one - other).abs() < 1e-5, "{one} {other}");
         }
         assert_eq!(scene.shapes.len(), 12);
-    }
-
-    #[test]
-    fn capsule_has_the_given_ends() {
-        let ends = [DVec3::new(0.1, -0.2, 0.3), DVec3::new(0.4, 0.5, -0.6)];
-        let shape = capsule(0, 0.01, ends);
-        let [x, y, z, qw, qx, qy, qz] = shape.offset;
-        let tip = Vec3::new(x, y, z) + Quat::from_xyzw(qx, qy, qz, qw) * Vec3::new(0.0, 0.0, shape.size[1]);
-        assert!((tip - ends[1].as_vec3()).length() < 1e-6);
     }
 }

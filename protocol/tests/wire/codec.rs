@@ -1,6 +1,7 @@
 //! What the codec holds for all messages and all bytes.
 
 use std::fmt::Debug;
+use std::sync::Arc;
 
 use proptest::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -338,7 +339,8 @@ fn scene_survives_the_wire_and_a_shape_without_a_body_is_refused() {
     let error = convert::decode_scene(stray).expect_err("there are two bodies");
     assert_eq!((error.code, error.message.as_str()), (ErrorCode::OutOfRange, "`shapes` has body 2; there are 2"));
     let mut stray = reply.clone();
-    stray.shapes[4].mesh.as_mut().expect("the head has a mesh").faces[0][1] = 4;
+    let head = stray.shapes[4].mesh.as_mut().expect("the head has a mesh");
+    Arc::make_mut(head).faces[0][1] = 4;
     let error = convert::decode_scene(stray).expect_err("there are four points");
     assert_eq!(error.message, "`shapes.mesh.faces` has point 4; there are 4");
     let error = convert::decode_scene(RenderReply { pose: &reply.pose[..28], ..reply }).expect_err("one pose of two");

@@ -5,6 +5,7 @@
 
 use std::fmt::Debug;
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 use twinstep_model::{
@@ -357,7 +358,7 @@ pub fn small_scene() -> Scene {
     };
     // The head, a tetrahedron.
     let points = vec![[0.0625, 0.0, 0.0], [-0.0625, 0.0625, 0.0], [-0.0625, -0.0625, 0.0], [-0.03125, 0.0, 0.125]];
-    let mesh = Some(ConvexMesh { points, faces: vec![[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]] });
+    let mesh = Some(Arc::new(ConvexMesh { points, faces: vec![[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]] }));
     let head = SceneShape { colour: Some([0.75, 0.5, 0.25]), mesh, ..shape(0, ShapeKind::Convex, [0.0; 3], 0.0625) };
     Scene {
         bodies: vec!["trunk".to_owned(), "FL_hip".to_owned()],
