@@ -90,7 +90,8 @@ fn start(path: &Path, model: Option<&Path>, args: &WalkArgs) -> Result<(PolicyWa
     let load = || read()?.bind(env.spec()).map_err(input);
     let policies = (0..robots).map(|_| load()).collect::<Result<Vec<_>, _>>()?;
     env.reset(&ResetRequest::seeded(args.seed, robots)).map_err(other)?;
-    let title = format!("policy {} on {robots} simulated robots", path.display());
+    let plural = if robots == 1 { "" } else { "s" };
+    let title = format!("policy {} on {robots} simulated robot{plural}", path.display());
     let scene = SceneInfo {
         is_interactive: true,
         velocity_bounds: env.spec().observation_field("velocity_command").map(|_| velocity_input::limits()),

@@ -91,24 +91,35 @@ function tiled(corners) {
   return made;
 }
 
+// Corners of a tile at the index (i, j) of a square of `count` times `count` tiles around the origin.
+function levelTile(count, i, j, z) {
+  const [x, y] = [i, j].map((index) => TILE * (index - count / 2));
+  return [x, y, z, x + TILE, y, z, x + TILE, y + TILE, z, x, y, z, x + TILE, y + TILE, z, x, y + TILE, z];
+}
+
 // A square of `count` times `count` tiles in z = 0.
 export function levelGround(count) {
   const corners = [];
-  const quad = ([x, y]) => [x, y, 0, x + TILE, y, 0, x + TILE, y + TILE, 0, x, y, 0, x + TILE, y + TILE, 0, x, y + TILE, 0];
-  for (let i = 0; i < count; i += 1) {
-    for (let j = 0; j < count; j += 1) corners.push(...quad([i, j].map((index) => TILE * (index - count / 2))));
-  }
+  for (let i = 0; i < count; i += 1) for (let j = 0; j < count; j += 1) corners.push(...levelTile(count, i, j, 0));
   return tiled(corners);
 }
 
-// A height field.
-export function fieldGround({ shape: [rows, columns], origin, cell_size: cell, heights }) {
+// A height field, and level tiles around it, as in the simulation.
+export function fieldGround({ shape: [rows, columns], origin, cell_size: cell, heights }, count) {
   const corners = [];
   const point = (i, j) => [origin[0] + i * cell, origin[1] + j * cell, heights[i * columns + j]];
   for (let i = 0; i + 1 < rows; i += 1) {
     for (let j = 0; j + 1 < columns; j += 1) {
       const [a, b, c, d] = [point(i, j), point(i + 1, j), point(i + 1, j + 1), point(i, j + 1)];
       corners.push(...a, ...b, ...d, ...d, ...b, ...c);
+    }
+  }
+  const size = [rows, columns].map((points) => (points - 1) * cell);
+  for (let i = 0; i < count; i += 1) {
+    for (let j = 0; j < count; j += 1) {
+      const middle = [i, j].map((index) => TILE * (index + 0.5 - count / 2));
+      const isInside = middle.every((at, axis) => at > origin[axis] && at < origin[axis] + size[axis]);
+      if (!isInside) corners.push(...levelTile(count, i, j, heights[0]));
     }
   }
   return tiled(corners);

@@ -60,7 +60,7 @@ export class Stage {
   begin(info) {
     this.info = info;
     this.geometries = info.bodies.map((_, body) => bodyGeometry(info.shapes, body));
-    const ground = info.heights ? fieldGround(info.heights) : levelGround(GROUND_TILES);
+    const ground = info.heights ? fieldGround(info.heights, GROUND_TILES) : levelGround(GROUND_TILES);
     this.ground = new Mesh(ground, new MeshStandardMaterial({ vertexColors: true, roughness: 0.95 }));
     this.ground.receiveShadow = true;
     // Feet are a little in the ground.

@@ -49,16 +49,17 @@ const PICTURES: [Picture; 7] = [
         command: &["view", "data/policies/walk.safetensors", "--robots", "64"],
         size: [1200, 800],
         prepare: "for (const id of ['panel', 'controls', 'stick', 'help', 'status']) document.getElementById(id).style.display \
-                  = 'none'; dispatchEvent(new Event('resize')); document.getElementById('scene').dispatchEvent(new \
-                  WheelEvent('wheel', { deltaY: 400, bubbles: true, cancelable: true }))",
-        ready: || format!("{TIME} > 6"),
+                  = 'none'; dispatchEvent(new Event('resize')); for (let turn = 0; turn < 24; turn += 1) \
+                  document.getElementById('scene').dispatchEvent(new WheelEvent('wheel', { deltaY: 100, bubbles: true, \
+                  cancelable: true }))",
+        ready: || format!("{TIME} > 1.5"),
     },
     Picture {
         name: "view_stairs",
         command: &["view", "data/policies/walk_terrain.safetensors", "--ground", "stairs=0.12", "--robots", "2"],
         size: [1300, 800],
         prepare: "0",
-        ready: || format!("{TIME} > 5"),
+        ready: || format!("{TIME} > 3"),
     },
     Picture {
         name: "view_log",
