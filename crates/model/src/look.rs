@@ -6,8 +6,8 @@ use std::cell::RefCell;
 
 use glam::{DVec2, DVec3};
 
+use crate::RobotModel;
 use crate::scene_shape::{SceneShape, convex, cylinder, sphere};
-use crate::{NUM_LEGS, RobotModel};
 
 /// Colours (sRGB, from 0 to 1): painted shell, dark plastic, motor, steel, rubber.
 const SHELL: [f32; 3] = [0.82, 0.84, 0.86];
@@ -93,9 +93,10 @@ fn loft(body: u32, colour: [f32; 3], axis: Axis, scale: f64, sections: &[Section
 }
 
 /// What the parts depend on.
-#[derive(Clone, Copy, PartialEq)]
+#[derive(PartialEq)]
 struct Dimensions {
-    origins: [[DVec3; 3]; NUM_LEGS],
+    /// Of the joints of each leg, as in the model.
+    origins: Vec<[DVec3; 3]>,
     foot_centre: DVec3,
     foot_radius: f64,
 }
@@ -109,19 +110,22 @@ thread_local! {
 pub(crate) fn look(robot: &RobotModel) -> Vec<SceneShape> {
     let RobotModel { legs, shapes, .. } = robot;
     let dimensions = Dimensions {
-        origins: std::array::from_fn(|leg| legs[leg].origins),
+        origins: legs.iter().map(|leg| leg.origins).collect(),
         foot_centre: shapes.foot_centre,
         foot_radius: shapes.foot_radius,
     };
     LAST.with_borrow_mut(|last| match last {
         Some((known, parts)) if *known == dimensions => parts.clone(),
-        _ => last.insert((dimensions, dimensions.parts())).1.clone(),
+        _ => {
+            let parts = dimensions.parts();
+            last.insert((dimensions, parts)).1.clone()
+        }
     })
 }
 
 impl Dimensions {
     fn parts(&self) -> Vec<SceneShape> {
-        trunk(self).into_iter().chain((0..NUM_LEGS).flat_map(|leg| self::leg(self, leg))).collect()
+        trunk(self).into_iter().chain((0..self.origins.len()).flat_map(|leg| self::leg(self, leg))).collect()
     }
 }
 
