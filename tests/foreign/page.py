@@ -7,10 +7,10 @@ import json
 import statistics
 from pathlib import Path
 
-from score import RATES, Case, case_table, wilson
+from score import RATES, Case, case_table, family_rows, wilson
 
 SUITES = {
-    "single": ("One effect of the catalogue", "Each of 27 effects once, at 20 to 100 % of its range."),
+    "single": ("One effect of the catalogue", "Each of the 27 effects equally often, at 20 to 100 % of its range."),
     "healthy": ("Nothing hidden", "Robots with the errors that every robot of the generator has."),
     "pairs": (
         "Two effects of the catalogue",
@@ -63,6 +63,7 @@ def section(folder: Path, suite: str) -> list[str]:
         f"Predicted gain, 90 % interval: median width {share}.",
         "",
         *rates(cases),
+        *(family_rows(cases) if suite == "single" else []),
         "",
         *case_table(cases),
     ]

@@ -133,7 +133,7 @@ def family_rows(cases: list[Case]) -> list[str]:
     """Return the lines of a table with one row per family."""
     lines = [
         "",
-        "## Families",
+        "### By effect",
         "",
         "| family | cases | first | among | scope | wrong name |",
         "|---|---|---|---|---|---|",
