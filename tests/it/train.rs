@@ -316,6 +316,8 @@ fn ground_of_one_kind_has_one_level_with_the_robots_and_pushes_of_a_condition() 
     assert!(calm >= 58 && pushed <= calm, "{calm} {pushed}");
     // Who stands in the middle does not arrive.
     assert_eq!(arrived(&["--ground", "stairs=0.1", "--speed", "0"]), 0);
+    let (is_ok, _, error) = judge(&["--speed", "0.5"]);
+    assert!(!is_ok && error.contains("--course") && error.contains("--ground"), "{error}");
     for (ground, reason) in [("sand=1", "slope, stairs, obstacles, wave or rough"), ("stairs=2", "stairs_m")] {
         let (is_ok, _, error) = judge(&["--ground", ground]);
         assert!(!is_ok && error.contains(reason), "{error}");

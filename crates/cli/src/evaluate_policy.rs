@@ -43,7 +43,7 @@ use crate::serve::engine;
 /// Examples: `twinstep evaluate-policy walk/policy.safetensors` and `twinstep evaluate-policy
 /// walk/policy.safetensors --engine mujoco --robots 64`
 #[derive(clap::Args)]
-#[command(verbatim_doc_comment)]
+#[command(verbatim_doc_comment, group(clap::ArgGroup::new("on_course").args(["course", "ground"]).multiple(true)))]
 pub struct Args {
     /// Policy file (safetensors).
     policy: PathBuf,
@@ -74,9 +74,9 @@ pub struct Args {
     /// Walk over this ground instead: slope [rad], stairs, obstacles, wave or rough [m]; repeat it for several.
     #[arg(long, value_name = "KIND=SIZE", value_parser = ground_arg::ground, conflicts_with_all = ["course", "seconds", "film"])]
     ground: Vec<GroundArg>,
-    /// Commanded velocity forward on a course or a ground [m/s].
-    #[arg(long, value_name = "M_S", default_value_t = CourseWalking::SPEED)]
-    speed: f32,
+    /// Commanded velocity forward on a course or a ground [m/s]. Default: 0.8.
+    #[arg(long, value_name = "M_S", requires = "on_course")]
+    speed: Option<f32>,
     /// Print one JSON object on stdout.
     #[arg(long)]
     json: bool,
@@ -98,7 +98,7 @@ impl Args {
     /// Returns the course that is asked for.
     fn course(&self) -> Option<Course> {
         let terrain = if self.course { Some(CourseTerrain::FULL) } else { ground_arg::course(&self.ground) };
-        terrain.map(|terrain| Course { terrain, speed: self.speed })
+        terrain.map(|terrain| Course { terrain, speed: self.speed.unwrap_or(CourseWalking::SPEED) })
     }
 
     fn options(&self) -> EvaluatePolicyOptions {

@@ -191,10 +191,12 @@ fn leg(robot: &Dimensions, leg: usize) -> Vec<SceneShape> {
     let plate = |z: f64, x: f64, half: [f64; 2]| section(z, [x, side * 0.004], half, 0.009);
     let shank = |z: f64, x: f64, half: [f64; 2]| section(z, [x, 0.0], half, 0.006);
     let arm = |y: f64| section(side * y, [0.0, 0.0], [0.032, 0.034], 0.012);
-    let mut arms = [arm(0.02), arm(out - 0.03)];
+    // From the hip joint to the thigh, whatever their distance.
+    let mut arms = [arm(0.0), arm(out.max(0.01))];
     arms.sort_by(|one, other| one.along.total_cmp(&other.along));
     let foot = robot.foot_centre;
-    let length = foot.length() / scale;
+    // Places along the shank, as shares of its length.
+    let down = |share: f64| -share * foot.length() / scale;
     vec![
         cylinder(hip, MOTOR, scale * 0.044, [-0.037, 0.037].map(|x| scale * DVec3::new(x, 0.0, 0.0))),
         loft(hip, PLASTIC, Axis::Y, scale, &arms),
@@ -221,8 +223,8 @@ fn leg(robot: &Dimensions, leg: usize) -> Vec<SceneShape> {
             Axis::Z,
             scale,
             &[
-                shank(-0.12, 0.012, [0.010, 0.009]),
-                shank(-0.02, 0.003, [0.017, 0.013]),
+                shank(down(0.56), 0.012, [0.010, 0.009]),
+                shank(down(0.09), 0.003, [0.017, 0.013]),
                 shank(0.012, -0.002, [0.013, 0.012]),
             ],
         ),
@@ -231,7 +233,7 @@ fn leg(robot: &Dimensions, leg: usize) -> Vec<SceneShape> {
             PLASTIC,
             Axis::Z,
             scale,
-            &[shank(-length + 0.008, foot.x / scale, [0.009, 0.009]), shank(-0.115, 0.012, [0.010, 0.009])],
+            &[shank(down(0.96), foot.x / scale, [0.009, 0.009]), shank(down(0.54), 0.012, [0.010, 0.009])],
         ),
         sphere(calf, RUBBER, robot.foot_radius, foot),
     ]
@@ -240,20 +242,37 @@ fn leg(robot: &Dimensions, leg: usize) -> Vec<SceneShape> {
 #[cfg(test)]
 mod tests {
     use glam::Vec3;
+    use proptest::prelude::*;
 
     use super::*;
     use crate::go2;
 
-    #[test]
-    fn every_part_is_convex_and_its_faces_look_outwards() {
-        {
-            for mesh in look(&go2()).iter().filter_map(|part| part.mesh.as_ref()) {
+    /// A robot with legs, hips and shanks of other proportions.
+    fn stretched(trunk: f64, out: f64, thigh: f64, shank: f64) -> RobotModel {
+        let mut robot = go2();
+        for leg in &mut robot.legs {
+            leg.origins[0] *= trunk;
+            leg.origins[1].y *= out;
+            leg.origins[2] *= thigh;
+        }
+        robot.shapes.foot_centre *= shank;
+        robot
+    }
+
+    proptest! {
+        #[test]
+        fn every_part_is_convex_and_its_faces_look_outwards(
+            trunk in 0.5..2.0, out in 0.0..2.0, thigh in 0.5..2.0, shank in 0.5..2.0
+        ) {
+            let robot = stretched(trunk, out, thigh, shank);
+            for mesh in look(&robot).iter().filter_map(|part| part.mesh.as_ref()) {
                 let points: Vec<Vec3> = mesh.points.iter().copied().map(Vec3::from).collect();
                 for face in &mesh.faces {
                     let [a, b, c] = face.map(|point| points[usize::from(point)]);
                     let normal = (b - a).cross(c - a).normalize();
+                    prop_assert!(normal.dot(a) > 0.0, "{face:?} looks inwards");
                     for point in &points {
-                        assert!(normal.dot(*point - a) < 1e-5, "{point} is outside of {face:?}");
+                        prop_assert!(normal.dot(*point - a) < 1e-5, "{point} is outside of {face:?}");
                     }
                 }
             }

@@ -8,7 +8,7 @@ use crate::web_server::{INDEX, MODULES, STYLE, VIEW_SCRIPT};
 
 /// Returns a page (HTML) that plays `frames` of `scene`, with pause, speed and a slider for the time.
 ///
-/// It has some 0.8 MB and 1.3 times the bytes of the frames.
+/// It has some 0.9 MB and 1.3 times the bytes of the frames.
 pub fn static_page(scene: &SceneInfo, frames: &[Frame]) -> String {
     let bytes: Vec<u8> = frames.iter().flat_map(Frame::to_bytes).collect();
     let scene = SceneInfo { is_interactive: true, is_learning: false, velocity_bounds: None, ..scene.clone() };
